@@ -19,21 +19,8 @@ CAMPAIGN = {
     },
     "design": {"kind": "sobol", "count": 64, "seed": 1},
 }
-
-
 TWO = {"scene": "table1", "design": {"kind": "random", "count": 2}}
-
-
-TOML = """
-scene = "table1"
-target_error = 0.1
-keep = ["truth", "waveform"]
-[parameters]
-bottom_depth = { low = 2.0, high = 20.0 }
-[design]
-kind = "random"
-count = 3
-"""
+RANGE = {"low": 1.0, "high": 2.0, "steps": 10**6}
 
 
 def changed(**sections):
@@ -54,34 +41,22 @@ def test_columns_in_the_order_of_the_file_within_their_ranges():
     assert min(np.unique(table["wind_speed"], return_counts=True)[1]) >= 20
 
 
-@pytest.mark.parametrize("kind", ["sobol"])
-def test_same_seed_same_runs(kind):
-    def table(seed):
-        return Campaign.of_file(changed(design={"kind": kind, "count": 37, "seed": seed})).table()
-
-    first, again, other = table(1), table(1), table(2)
+def test_same_seed_same_runs_and_a_latin_hypercube_has_one_in_each_part_of_a_range():
+    first, again, other = (
+        Campaign.of_file(changed(design={"kind": "sobol", "count": 37, "seed": seed})).table() for seed in (1, 1, 2)
+    )
     for name in first:
         np.testing.assert_array_equal(first[name], again[name])
     assert not np.array_equal(first["bottom_depth"], other["bottom_depth"])
-
-
-def test_latin_hypercube_has_one_run_in_each_part_of_a_range():
     table = Campaign.of_file(changed(design={"kind": "latin_hypercube", "count": 36})).table()
     parts = np.floor((table["bottom_depth"] - 2) / 18 * 36).astype(int)
     assert sorted(parts) == list(range(36))
 
 
 def test_grid_has_all_combinations():
-    given = changed(
-        parameters={
-            "bottom_depth": {"low": 2, "high": 20, "steps": 3},
-            "attenuation": {"low": 0.1, "high": 1, "scale": "log", "steps": 3},
-            "layout": ["1x1", "2x2"],
-        },
-        fixed=None,
-        design={"kind": "grid"},
-    )
-    table = Campaign.of_file(given).table()
+    ranges = {"bottom_depth": {"low": 2, "high": 20}, "attenuation": {"low": 0.1, "high": 1, "scale": "log"}}
+    parameters = {name: {**one, "steps": 3} for name, one in ranges.items()} | {"layout": ["1x1", "2x2"]}
+    table = Campaign.of_file(changed(parameters=parameters, fixed=None, design={"kind": "grid"})).table()
     assert len(table["layout"]) == 18
     assert len(set(zip(*(column.tolist() for column in table.values()), strict=True))) == 18
     np.testing.assert_allclose(np.unique(table["bottom_depth"]), [2, 11, 20])
@@ -97,7 +72,7 @@ def test_table_of_a_file(tmp_path):
     assert table["altitude"].tolist() == [100, 150]
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("text", "message"),
     [
         ("bottom_depth\n", "a row for each run"),
@@ -114,11 +89,12 @@ def test_invalid_tables(tmp_path, text, message):
 
 
 def test_read(tmp_path):
-    (tmp_path / "campaign.toml").write_text(TOML)
+    lines = ["scene = 'table1'", "target_error = 0.1", "keep = ['truth', 'waveform']", "[parameters]"]
+    lines += ["bottom_depth = { low = 2.0, high = 20.0 }", "[design]", "kind = 'random'", "count = 3"]
+    (tmp_path / "campaign.toml").write_text("\n".join(lines))
     campaign = Campaign.read(tmp_path / "campaign.toml")
     assert campaign.parameters == {"bottom_depth": Range(2, 20)}
-    assert campaign.keep == ("waveform", "truth")
-    assert campaign.target_error == 0.1
+    assert (campaign.keep, campaign.target_error) == (("waveform", "truth"), 0.1)
     assert len(campaign.table()["bottom_depth"]) == 3
     again = Campaign.from_json(campaign.text)
     np.testing.assert_array_equal(again.table()["bottom_depth"], campaign.table()["bottom_depth"])
@@ -131,14 +107,25 @@ def test_scene_beside_the_file(tmp_path):
     assert Campaign.of_file(TWO, tmp_path).scene == "table1"
 
 
-@pytest.mark.parametrize("text", ["scene = ", "\x00"])
-def test_file_that_is_not_toml(tmp_path, text):
+#: TOML of 480 brackets is read, and ended in a traceback behind the reader.
+NESTED = [f'scene = "table1"\n[fixed]\nlayout = {depth * "["}{depth * "]"}\n' for depth in (120, 300, 480)]
+
+
+@each_row(
+    ("text", "message"),
+    [
+        ("scene = ", r"campaign\.toml is not a TOML file: "),
+        ("\x00", r"campaign\.toml is not a TOML file: "),
+        *((text, "is nested more than 100 deep") for text in NESTED),
+    ],
+)
+def test_files_that_are_no_campaign(tmp_path, text, message):
     (tmp_path / "campaign.toml").write_text(text)
-    with pytest.raises(UserError, match=r"campaign\.toml is not a TOML file: "):
+    with pytest.raises(UserError, match=message):
         Campaign.read(tmp_path / "campaign.toml")
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("sections", "message"),
     [
         ({"keep": ["waveform", "light"]}, "keep holds 'light'"),
@@ -146,43 +133,25 @@ def test_file_that_is_not_toml(tmp_path, text):
         ({"gain": "auto"}, "gain = 'auto' needs a receiver"),
         ({"fixed": {"bottom_depth": 3}}, r"'bottom_depth' is in \[fixed\] and in \[parameters\]"),
         ({"parameters": {"altitude": {"low": 3, "high": 3}}}, "altitude has the empty range 3 to 3"),
-        ({"parameters": {"altitude": {"low": 3, "high": 2}}}, "altitude has the empty range 3 to 2"),
         ({"parameters": {"altitude": {"low": 0, "high": 2, "scale": "log"}}}, r"altitude\.low = 0 must be positive"),
         ({"parameters": {"altitude": 3}}, r"altitude = 3 must be a range .* belongs to \[fixed\]"),
-        ({"parameters": {"altitude": []}}, r"altitude = \[\] must be a range"),
         ({"parameters": {"altitude": [1, "a"]}}, "altitude = .* must be a range"),
         ({"parameters": {"altitude": [1, float("nan")]}}, "altitude = nan"),
         ({"design": {"kind": "sobol"}}, "design.count = None: a design of kind 'sobol' needs a number of runs"),
         ({"design": {"kind": "grid", "count": 3}}, "design.count = 3"),
         ({"design": {"kind": "sobol", "count": 2, "file": "a.csv"}}, "design.file = 'a.csv'"),
         ({"design": {"kind": "table"}}, "design.file = None"),
-    ],
-)
-def test_invalid_campaigns(sections, message):
-    with pytest.raises(UserError, match=message):
-        Campaign.of_file(changed(**sections))
-
-
-@each_row(
-    ("sections", "message"),
-    [
         ({"parameters": {}}, "no parameters to vary"),
         ({"parameters": {"a": "b", "b": "a", "c": [1, 2]}}, "a, b depend on each other in a circle"),
         ({"parameters": {"a": "z + 1", "c": [1, 2]}}, "needs z, which is neither"),
         ({"parameters": {"a": "1 / c", "c": [0, 0.0]}}, "not finite"),
         ({"parameters": {"a": "2 * c", "c": ["x", "y"]}}, "needs c, whose values are texts"),
-        (
-            {"parameters": {"a": {"low": 0, "high": 1}}, "design": {"kind": "grid"}},
-            r"a\.steps is missing: the range of a grid",
-        ),
+        ({"parameters": {"a": {"low": 0, "high": 1}}, "design": {"kind": "grid"}}, r"a\.steps is missing: the range"),
     ],
 )
-def test_impossible_designs(sections, message):
+def test_invalid_campaigns(sections, message):
     with pytest.raises(UserError, match=message):
         Campaign.of_file(changed(**sections)).table()
-
-
-RANGE = {"low": 1.0, "high": 2.0, "steps": 10**6}
 
 
 @pytest.mark.parametrize(
@@ -212,12 +181,3 @@ def test_unknown_parameters_are_refused_before_the_table_is_made(monkeypatch):
     monkeypatch.setattr(Campaign, "table", lambda self: pytest.fail("the table was made"))
     with pytest.raises(UserError, match="parameter 'nothing' is not one of scene table1"):
         render_row(campaign, 0)
-
-
-@pytest.mark.parametrize("depth", [120, 300, 480])
-def test_deep_lists_are_refused(tmp_path, depth):
-    """TOML of 480 brackets is read, and ended in a traceback behind the reader."""
-    path = tmp_path / "a.toml"
-    path.write_text(f'scene = "table1"\n[fixed]\nlayout = {depth * "["}{depth * "]"}\n')
-    with pytest.raises(UserError, match="is nested more than 100 deep"):
-        Campaign.read(path)

@@ -31,26 +31,15 @@ def test_names_are_those_of_parameters():
 @each_row(
     ("text", "part"),
     [
-        ("__import__('os')", "may hold"),
+        *(
+            (text, "may hold")
+            for text in ("__import__('os')", "a if b else c", "[1, 2]", "sqrt(1, 2)", "min(1)", "'text'")
+        ),
+        *((text, "may hold") for text in ("True", "a < b", "a // b", "a @ b", "~a", "sqrt(x=2)", "round(2)")),
+        *((text, "no expression") for text in ("a = 2", "2 *", "", "(" * 240 + "1" + ")" * 240)),
         ("a.b", "'a.b'"),
-        ("a if b else c", "may hold"),
-        ("[1, 2]", "may hold"),
-        ("a = 2", "no expression"),
-        ("2 *", "no expression"),
-        ("", "no expression"),
-        ("sqrt(1, 2)", "may hold"),
-        ("min(1)", "may hold"),
-        ("'text'", "may hold"),
-        ("True", "may hold"),
-        ("a < b", "may hold"),
-        ("a // b", "may hold"),
-        ("a @ b", "may hold"),
-        ("~a", "may hold"),
-        ("sqrt(x=2)", "may hold"),
-        ("round(2)", "may hold"),
-        ("(" * 240 + "1" + ")" * 240, "no expression"),
-        ("+".join(["a"] * 300), "has 599 characters: it may have 500"),
         ("a" + ".b" * 240, "may hold"),
+        ("+".join(["a"] * 300), "has 599 characters: it may have 500"),
     ],
 )
 def test_anything_else_is_refused(text, part):
@@ -59,7 +48,7 @@ def test_anything_else_is_refused(text, part):
     assert part in str(error.value)
 
 
-@pytest.mark.parametrize("text", ["1 / (a - 1)", "log(a - 1)", "10 ** 400", "sqrt(-a)"])
+@each_row("text", ["1 / (a - 1)", "log(a - 1)", "10 ** 400", "sqrt(-a)"])
 def test_values_must_be_finite(text):
     with pytest.raises(UserError, match="not finite"):
         Expression("x", text).evaluate({"a": np.array([1.0, 2.0])})

@@ -15,7 +15,6 @@ import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue, scenes
 from mitransient_lidar.rendering.passes import Goal, run_passes
-from mitransient_lidar.rendering.passive import render_passive
 
 NAN = float("nan")
 
@@ -40,33 +39,22 @@ LISTS = "layer_tops attenuation scattering backscattering water_scattering chi_p
 TABLE1 = {
     ("inf", "must be finite"): NUMBERS.split()[::6],
     ("", "is empty: it must have a value"): [*NUMBERS.split()[1::6], "layer_tops", "bin_count", "layout"],
-    ("deep", "must be a number"): NUMBERS.split()[2::6],
+    ("deep", "must be a number"): [*NUMBERS.split()[2::6], "bin_count"],
     ("1 2", "must be one number"): "pulse_energy_mj altitude",
     ("1 2", "must be a number"): "divergence_mrad",
-    ("-1", "must lie between"): "divergence_mrad off_nadir_deg field_of_view_mrad",
-    ("1e30", "must lie between"): [*NUMBERS.split()[4::6], "attenuation", "layer_tops", "backscattering"],
+    ("1e30", "must lie between"): [*NUMBERS.split()[4::6], "attenuation", "layer_tops"],
     ("1.3,", "has an empty entry"): LISTS.split()[::3],
     (",", "is empty"): LISTS.split()[1::3],
     ("0.2, x", "must hold numbers only"): LISTS.split()[2::3],
     ("nan, 2", "must be finite"): "layer_tops scattering",
-    ("-2000", "must lie between -1000 and 1e+06"): "altitude",
     ("1e12", "must be an integer"): "surface_seed",
-    ("2.5", "must be an integer"): "bin_count surface_seed",
-    ("few", "must be a number"): "bin_count surface_seed",
-    ("0", "must lie between 1 and 1000000"): "bin_count",
-    ("-3", "must lie between 0 and"): "surface_seed",
-    ("1.5", "must lie between 0 and 1"): "bottom_reflectance",
+    ("2.5", "must be an integer"): "bin_count",
     ("-8", "must not be negative: the scene uses it as -$bottom_depth"): "bottom_depth",
-    ("95", "must lie between 0 and 89.9"): "off_nadir_deg",
-    ("4e7", "must lie between -1e+07 and 1e+07"): "aim_x aim_y",
     ("2by2", "must be rows x columns"): "layout",
     ("0x2", "layout"): "layout",
     ("9999x9999", "at most 4194304"): "layout",
     ("hex8", "hexagons"): "layout",
-    ("swell", "must be one of"): "spectrum",
-    ("mie", "must be one of"): "phase_function",
     ("some", "must be"): "slope_variance surface_cell_size surface_refined_size",
-    ("0.9", "must lie between 1"): "refractive_index group_index",
     ("0.4", "must not exceed attenuation = 0.3"): "scattering",
     ("0.2", "must not exceed scattering = 0.15"): "backscattering",
     ("0.1", "scattering = 0.15 must not exceed"): "attenuation",
@@ -74,17 +62,14 @@ TABLE1 = {
     ("3, 0", "must start at 0 m"): "layer_tops",
 }
 #: Of the other scenes, one of each kind: their numbers take the same way.
-TARGET = {("", "is empty"): "target_x", ("0", "must be greater than 0"): "target_size"}
-TARGET |= {("-9", "must not be negative"): "target_depth"}
-GATED = {("-2", "must be greater than 0"): "plate_size", ("0.5", "must be an integer"): "gate_count pulses"}
-GATED |= {("nan", "must be finite"): "gate_start_depth", ("0", "must lie between"): "gate_width_ns gate_step_ns"}
-PASSIVE = {("inf", "must be finite"): "plate_depth", ("1e9", "must lie between"): "sun_zenith_deg"}
-PARAMETERS = [
-    *rows("table1", TABLE1),
-    *rows("fig02_mine", TARGET),
-    *rows("gated_mine", GATED),
-    *rows("passive_sea", PASSIVE),
+OTHERS = [
+    *rows(
+        "fig02_mine", {("0", "must be greater than 0"): "target_size", ("-9", "must not be negative"): "target_depth"}
+    ),
+    *rows("gated_mine", {("0.5", "must be an integer"): "pulses", ("0", "must lie between"): "gate_width_ns"}),
+    *rows("passive_sea", {("inf", "must be finite"): "plate_depth", ("1e9", "must lie between"): "sun_zenith_deg"}),
 ]
+PARAMETERS = rows("table1", TABLE1) + OTHERS
 
 
 @pytest.fixture
@@ -128,7 +113,6 @@ OPTIONS = [
     (RENDER, "--passes", "2.5", "must be a valid integer"),
     (RENDER, "--passes", "100000000000000000000", "must lie between 2 and 1000000000"),
     (RENDER, "--variant", "scalar_rgb", "is not supported: allowed are"),
-    (RENDER, "--integrator", "path", "is not a lidar integrator"),
     (RENDER, "--integrator", "lidar_mergin", "did you mean lidar_merging"),
     (RENDER, "--integrator", "passive_volpath", "has no laser"),
     (RENDER, "-D", "altitude", "is not of the form name=value"),
@@ -137,35 +121,20 @@ OPTIONS = [
     (RENDER, "--passs", "3", "No such option"),
     (("find-shots", "table1"), "--slope-sigmas", "20", "the sea has no place of the kind towards"),
     (("find-shots", "table1"), "--at", "3", "must be two numbers"),
-    (("find-shots", "table1"), "--at", "3,nan", "must be finite"),
-    (("find-shots", "table1"), "--at", "3,", "has an empty entry"),
     (("find-shots", "table1"), "--output", "a.txt", "must end in .png"),
     (("detect", "fig13_2x2"), "--depths", "4,,8", "has an empty entry"),
     (("detect", "fig13_2x2"), "--receiver", "eye", "must be one of ideal"),
     (("depth-bias", "eye"), "--seed", "1", "instrument = 'eye' is not known"),
-    (
-        ("depth-bias", "riegl_vq880g2_infrared"),
-        "--seed",
-        "1",
-        "has wavelength_nm = 1064: depth errors are of green light",
-    ),
+    (("depth-bias", "riegl_vq880g2_infrared"), "--seed", "1", "wavelength_nm = 1064: depth errors are of green light"),
     (("depth-bias", "riegl_vq840g"), "--waters", ",", "--waters = ',' has an empty entry"),
-    (("tpu", "eye"), "--seed", "1", "instrument = 'eye' is not known"),
-    (("tpu", "riegl_vq840g"), "--estimator", "eye", "estimator = 'eye' must be one of threshold"),
     (("tpu", "icesat2_atlas"), "--seed", "1", "no shipped corrections of the instrument icesat2_atlas"),
-    (("beam-spread", "fig09_2x2"), "--depths", "2;5", "must hold numbers only"),
-    (("water", "mud"), "--tolerance", "0.1", "kind = 'mud'"),
 ]
-
-
-@each_row(("command", "option", "value", "part"), OPTIONS)
-def test_options(folder, command, option, value, part):
-    assert_refused(run(*command, option, value), part)
 
 
 @each_row(
     ("arguments", "part"),
     [
+        *(((*command, option, value), part) for command, option, value, part in OPTIONS),
         (["render"], "Missing argument 'SCENE'"),
         (["render", "table1", "two"], "Got unexpected extra argument"),
         (["rendr", "table1"], "No such command 'rendr'"),
@@ -174,16 +143,13 @@ def test_options(folder, command, option, value, part):
         (["render", "tabel1"], "did you mean table1"),
         (["render", "."], "is a folder"),
         (["render", "/dev/zero"], "cannot read /dev/zero: it is a device, and only regular files are read"),
-        (["render", "/dev/null"], "cannot read /dev/null: it is a device, and only regular files are read"),
         (["view", "/dev/zero"], "/dev/zero: it is a device"),
         (["view", "missing.nc"], "missing.nc"),
-        (["echoes", "/dev/zero"], "/dev/zero"),
         (["compare", "/dev/zero", "/dev/zero"], "/dev/zero: it is a device"),
         (["gates", "/dev/zero", "--start-ns", 1, "--width-ns", 1, "--count", 1], "/dev/zero"),
-        (["retrieve", "/dev/zero"], "/dev/zero"),
     ],
 )
-def test_commands_and_files(folder, arguments, part):
+def test_commands_and_options(folder, arguments, part):
     assert_refused(run(*arguments), part)
 
 
@@ -213,35 +179,19 @@ def replaced(old, new):
         (without("integrator"), "integrator: the scene has no lidar integrator"),
         (replaced("<film", '<float name="apertur_area" value="1"/><film'), "did you mean aperture_area"),
         (
-            replaced('name="interior"/>', 'name="interior"><float name="atenuation" value="1"/></medium>'),
-            "did you mean attenuation",
-        ),
-        (
             replaced('id="transmitter"/>', 'id="transmitter"><float name="divergense" value="1"/></emitter>'),
-            "there is no parameter divergense",
+            "divergense",
         ),
         (replaced('<float name="bin_width_ns"', '<float name="bin_with"'), "time_gated_film: there is no parameter"),
         (replaced('type="lidar_transmitter"', 'type="lidar_transmiter"'), "did you mean lidar_transmitter"),
-        (replaced('type="sediment"', 'type="sedimnt"'), "did you mean sediment"),
-        (
-            replaced('"-$bottom_depth"', '"-$bottom_dept"'),
-            "translate z = '-$bottom_dept' refers to an unknown parameter",
-        ),
+        (replaced('"-$bottom_depth"', '"-$bottom_dept"'), "z = '-$bottom_dept' refers to an unknown parameter"),
         (replaced('name="wind_speed" value="3"', 'name="wind_speed" value="inf"'), "wind_speed = inf must be finite"),
-        (replaced('name="wind_speed" value="3"', 'name="wind_speed" value=""'), "wind_speed = '' is empty"),
-        (replaced('"$bottom_reflectance"', '"1.2"'), "reflectance = 1.2 must lie between 0 and 1"),
         (replaced('<scale value="500"/>', '<scale value="0"/>'), "scale = 0 must be greater than 0"),
         (replaced("<film", "<fillm"), "not well-formed"),
-        (
-            replaced('<scene version="3.0.0">', '<scene version="3.0.0"><bsdf type="diffuse" id="receiver"/>'),
-            "duplicate",
-        ),
+        (replaced('"3.0.0">', '"3.0.0"><bsdf type="diffuse" id="receiver"/>'), "duplicate"),
         (lambda text: "", "not well-formed XML"),
         (lambda text: '<shape type="sphere" version="3.0.0"/>', "has a root element <shape>: it must be <scene>"),
-        (
-            lambda text: f"<scene version='3.0.0'>{'<shape>' * 50_000}{'</shape>' * 50_000}</scene>",
-            "nested more than 64 deep",
-        ),
+        (lambda text: f"<scene version='3.0.0'>{'<shape>' * 50_000}{'</shape>' * 50_000}</scene>", "more than 64 deep"),
     ],
 )
 def test_scene_files(tmp_path, folder, change, part):
@@ -272,18 +222,10 @@ SINGULAR = mi.ScalarTransform4f().scale(0)
     [
         (quietly(scene=3), "scene = 3 must be a shipped name, a path, a dict or a loaded scene"),
         (quietly(passes="8"), "passes = '8' must be an integer between 2 and 1000000000"),
-        (quietly(passes=1e20), "passes = 100000000000000000000 must lie between"),
-        (quietly(passes=True), "passes = True must be an integer"),
         (quietly(passes=np.array([3, 4])), "passes = array([3, 4]) must be an integer"),
-        (quietly(seed=2**64), "seed = 18446744073709551616 must lie between"),
-        (quietly(target_error="a"), "target_error = 'a' must be a number"),
-        (quietly(target_error=NAN), "target_error = nan must be finite"),
-        (quietly(max_time="long"), "max_time = 'long' must be a number"),
-        (quietly(max_memory={}), "max_memory = {} must be a number"),
         (quietly(variant=3), "variant = 3 is not supported"),
         (quietly(integrator=3), "integrator = 3 must be the name or the dict of an integrator"),
         (quietly(integrator={"type": "lidar_merging", "paths_per_pass": None}), "paths_per_pass = None must be"),
-        (quietly(integrator={"type": "lidar_merging", "paths": 3}), "lidar_merging: there is no parameter paths"),
         (quietly(params=["altitude"]), "params = ['altitude'] must be a dict of names and values"),
         (quietly(params={"altitude": None}), "altitude = None must be a number, a text or a list"),
         (quietly(params={3: 4}), "parameter 3 is not one of scene table1"),
@@ -294,7 +236,6 @@ SINGULAR = mi.ScalarTransform4f().scale(0)
         (as_dict(x={"type": "sphere", "radius": NAN}), "x.radius = nan must be finite"),
         (as_dict(x={"type": "sphere", "to_world": SINGULAR}), "x.to_world has a scale of 0"),
         (as_dict(x={"type": "multipixel_receiver", "aperture_area": 1e30}), "x.aperture_area = 1e+30 must lie between"),
-        (as_dict(x={"type": "diffuse", "reflectance": 1.5}), "x.reflectance = 1.5 must lie between 0 and 1"),
         (
             as_dict(x={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 2, 0]}}),
             "x.reflectance = 2 must lie between 0 and 1",
@@ -302,7 +243,6 @@ SINGULAR = mi.ScalarTransform4f().scale(0)
         (as_dict(x={"type": "seabed", "dept": 3.0}), "seabed: there is no parameter dept; did you mean depth"),
         (as_dict(**{"3": {3: 4}}), "scene: the key 3 must be a name"),
         (as_dict(x=NESTED), "nested more than 64 deep"),
-        (lambda: render_passive("passive_sea", passes="8"), "passes = '8' must be an integer"),
         (lambda: mitransient_lidar.open("/dev/zero"), "/dev/zero: it is a device"),
     ],
 )
@@ -312,24 +252,18 @@ def test_python_calls(folder, call, sentence):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "error", [MemoryError(), MemoryError("Unable to allocate 7 TiB"), RuntimeError("jit_malloc(): out of memory! ...")]
-)
-def test_exhausted_memory_is_one_sentence(error):
-    def render_pass(number, seed):
-        raise error
+def test_exhausted_memory_is_one_sentence_and_other_runtime_errors_stay_bugs():
+    texts = (MemoryError(), MemoryError("Unable to allocate 7 TiB"), RuntimeError("jit_malloc(): out of memory! ..."))
+    for error, kind, sentence in (
+        *((one, UserError, r"^memory ran out .*: use fewer bins, pixels or paths_per_pass") for one in texts),
+        (RuntimeError("a bug"), RuntimeError, "^a bug$"),
+    ):
 
-    with pytest.raises(UserError, match=r"memory ran out .*: use fewer bins, pixels or paths_per_pass") as caught:
-        run_passes(render_pass, Goal(passes=2), seed=0)
-    assert "\n" not in str(caught.value)
+        def render_pass(number, seed, error=error):
+            raise error
 
-
-def test_other_runtime_errors_stay_bugs():
-    def render_pass(number, seed):
-        raise RuntimeError("a bug")
-
-    with pytest.raises(RuntimeError, match="a bug"):
-        run_passes(render_pass, Goal(passes=2), seed=0)
+        with pytest.raises(kind, match=sentence):
+            run_passes(render_pass, Goal(passes=2), seed=0)
 
 
 @pytest.mark.slow

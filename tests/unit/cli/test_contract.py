@@ -60,7 +60,7 @@ FORMS = {
     "NAME=VALUE": ("attenuation=2", {"attenuation": 2.0}),
     "NAME=LOW:HIGH": ("attenuation=1:2", {"attenuation": (1.0, 2.0)}),
     "NAME=V1,V2,...": ("altitude=1,2", {"altitude": ["1", "2"]}),
-    "NAME[=STD]": ("scale", {"scale": math.inf}),
+    "NAME[=STD]": ("scale=0.05 time_offset", {"scale": 0.05, "time_offset": math.inf}),
 }
 MADE = sorted(name for name, row in COMMANDS.items() if row.function)
 
@@ -111,7 +111,7 @@ def sample(kind, option, default):
     kinds = {kind, *typing.get_args(kind)}
     if option[1].form in FORMS:
         text, value = FORMS[option[1].form]
-        return [flags[0], text], value
+        return [one for part in text.split() for one in (flags[0], part)], value
     if bool in kinds:
         return [option[0].secondary_opts[0] if default is True else flags[0]], default is not True
     low, high = option[1].low, option[1].high
@@ -163,7 +163,6 @@ def outside(kind, option):
 
 @pytest.mark.parametrize("command", MADE)
 def test_bad_values_are_refused_by_name(command, needed, tmp_path):
-    """The check is made before anything is rendered or written."""
     for name, (kind, option, _, parameter) in options_of(command).items():
         for value in [] if (command, name) in UNTRIED else [*outside(kind, option), *OTHERS.get((command, name), [])]:
             pair = option.form == "ALONG,ACROSS"

@@ -138,7 +138,6 @@ def test_corrected_depths_of_an_instrument_from_end_to_end(tmp_path):
 
 @pytest.mark.slow
 def test_derivatives_and_a_fit(scene, tmp_path):
-    """The fit of a result to its own scene."""
     options = [*FLAT, "--passes", 4, "--derivatives", "bottom_reflectance", "--derivatives", "target_depth"]
     check(run("render", scene, *options, "-o", tmp_path, "-q"))
     assert (tmp_path / "small_derivatives.png").stat().st_size > 0

@@ -3,33 +3,39 @@
 import os
 import shutil
 
-import numpy as np
 import pytest
+import synthetic_shots
 from command_line import GROUP, assert_refused, run, stub
 
 from mitransient_lidar import results
 from mitransient_lidar.cli import files, overwriting
 from mitransient_lidar.cli.app import COMMANDS
 from mitransient_lidar.core.marks import holds_mark, read_mark, write_mark
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
 #: Wrong options, found after the check of the files and before the render.
 WRONG = ["-D", "no_such_parameter=1"]
 OTHER = {"scene": "fig09_2x2"}
 
+INSTRUMENT = {"instrument": "other"}
+
+
+def figure(*words, files=("png", "nc"), other=OTHER):
+    """Return the row of a command that draws a figure, and its data beside it."""
+    return [*words, *WRONG, "-o", f"d/f.{files[0]}"], [f"d/f.{end}" for end in files], other
+
+
 #: For each command: its arguments, which fail once the files may be written; its files; what another subject is.
+GATES = ("gates.exr", "gates.png", "depth.png", "gates.gif", "gates.html", "components.png")
+FRAMES = (".nc", "_gates.exr", "_gates.png", "_depth.png")
 CASES = {
     "render": (
         ["table1", *WRONG, "-o", "d"],
-        ["d/table1.exr", "d/table1.nc", "d/table1.png", "d/table1_layout.png"],
+        [f"d/table1{end}" for end in (".exr", ".nc", ".png", "_layout.png")],
         OTHER,
     ),
     "render gates": (
         ["gated_mine", "--gif", "--html", "--components", *WRONG, "-o", "d"],
-        [
-            f"d/gated_mine_{name}"
-            for name in ("gates.exr", "gates.png", "depth.png", "gates.gif", "gates.html", "components.png")
-        ],
+        [f"d/gated_mine_{name}" for name in GATES],
         OTHER,
     ),
     "render instrument": (
@@ -37,40 +43,32 @@ CASES = {
         ["d/table1.nc"],
         {"instrument": ""},
     ),
-    "frames": (
-        ["gated_mine", *WRONG, "-o", "d"],
-        [f"d/gated_mine_frames{end}" for end in (".nc", "_gates.exr", "_gates.png", "_depth.png")],
-        OTHER,
-    ),
+    "frames": (["gated_mine", *WRONG, "-o", "d"], [f"d/gated_mine_frames{end}" for end in FRAMES], OTHER),
     "passive": (
         ["passive_sea", *WRONG, "-o", "d"],
         [f"d/passive_sea_passive{end}" for end in (".nc", ".exr", ".png")],
         OTHER,
     ),
     "shots": (["table1", *WRONG, "-o", "d/s.nc", "--figure", "d/f.svg"], ["d/s.nc", "d/f.svg", "d/f.nc"], OTHER),
-    "find-shots": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png"], OTHER),
-    "target-signal": (["fig13_2x2", *WRONG, "-o", "d/f.pdf"], ["d/f.pdf", "d/f.nc"], OTHER),
-    "detect": (["fig13_2x2", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
-    "estimate": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
+    "find-shots": figure("table1", files=["png"]),
+    "target-signal": figure("fig13_2x2", files=("pdf", "nc")),
+    "detect": figure("fig13_2x2"),
+    "estimate": figure("table1"),
     "depth-bias": (
         ["riegl_vq840g", *WRONG, "-o", "d/t.nc", "--figure", "d/t.png"],
         ["d/t.nc", "d/t.png"],
-        {"instrument": "other"},
+        INSTRUMENT,
     ),
     "tpu": (
         ["riegl_vq840g", *WRONG, "-o", "d"],
-        ["d/riegl_vq840g_tpu.nc", "d/riegl_vq840g_150m_20deg_tvu.csv", "d/riegl_vq840g_150m_20deg_orders.png"],
-        {"instrument": "other"},
+        [f"d/riegl_vq840g_{end}" for end in ("tpu.nc", "150m_20deg_tvu.csv", "150m_20deg_orders.png")],
+        INSTRUMENT,
     ),
-    "forecast": (
-        ["riegl_vq840g", "1:3", *WRONG, "-o", "d/f.png"],
-        ["d/f.png", "d/f.nc", "d/f.tif"],
-        {"instrument": "other"},
-    ),
-    "bounds": (["table1", "--free", "bottom_depth", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc", "d/f.csv"], OTHER),
-    "beam-spread": (["table1", "--depths", "2", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
-    "fov-sweep": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
-    "scattering-orders": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
+    "forecast": figure("riegl_vq840g", "1:3", files=("png", "nc", "tif"), other=INSTRUMENT),
+    "bounds": figure("table1", "--free", "bottom_depth", files=("png", "nc", "csv")),
+    "beam-spread": figure("table1", "--depths", "2"),
+    "fov-sweep": figure("table1"),
+    "scattering-orders": figure("table1"),
     "water": (["jerlov", "no_such_type", "-o", "d/f.png"], ["d/f.png"], {"kind": "petzold"}),
     "figures": (["fig09", "--target-error", "-1", "-o", "d"], ["d/fig09.png", "d/statements.csv"], None),
     "view": (["damaged.nc", "-o", "d/v.html", "--no-browser"], ["d/v.html"], OTHER),
@@ -118,16 +116,9 @@ def folder(tmp_path, monkeypatch, small_result):
 
 @pytest.fixture(scope="module")
 def small_result(tmp_path_factory):
-    """A result of two pixels, as a script saves it."""
+    """A result, as a script saves it."""
     path = tmp_path_factory.mktemp("result") / "shot.nc"
-    dataset = results.build(
-        *np.ones((4, 2, 5)),
-        time=TimeAxis(0.0, 1e-9, 5),
-        pixel_names=["a", "b"],
-        pixel_centres_mrad=np.zeros((2, 2)),
-        attributes={"scene": "table1"},
-    )
-    results.save(dataset, path)
+    results.save(synthetic_shots.result(scene="table1"), path)
     return path
 
 
@@ -227,7 +218,7 @@ def small_figures(monkeypatch):
 
 @pytest.mark.usefixtures("small_figures")
 @pytest.mark.slow
-def test_line_names_what_differs():
+def test_line_names_what_differs(folder):
     first = ["estimate", "table1", "--paths", 64, "-o", "d/a.png"]
     assert line(run(*first)) == []
     done = run(*first[:2], "-D", "wind_speed=6", "--paths", 128, "-o", "d/a.png")
@@ -239,6 +230,14 @@ def test_line_names_what_differs():
     done = run("estimate", "fig09_2x2", "--paths", 64, "-o", "d/a.png", "--overwrite")
     assert line(done) == ["replaces d/a.nc and 1 more: its scene is table1"]
     assert done.exit_code == 0
+    # Files of one name in two folders are two scenes.
+    for name in ("a", "b"):
+        (folder / name).mkdir()
+        run("scenes", "copy", "table1", f"{name}/lab.xml")
+    estimate = ["estimate", "--paths", 64, "-o", "d/f.png"]
+    assert run(*estimate, "a/lab.xml").exit_code == 0
+    assert_refused(run(*estimate, "b/lab.xml"), "since its scene file is ../a/lab.xml")
+    assert run(*estimate, folder / "a/lab.xml").exit_code == 0
 
 
 def test_result_of_an_earlier_release_counts_by_its_attributes(folder):
@@ -255,18 +254,6 @@ def test_result_of_an_earlier_release_counts_by_its_attributes(folder):
     assert_refused(command("render"), "since its scene is fig09_2x2")
     saved.to_netcdf("d/table1.nc", engine="h5netcdf")
     assert_refused(command("render"), "since no command has written it as it is")
-
-
-@pytest.mark.usefixtures("small_figures")
-@pytest.mark.slow
-def test_scene_files_of_one_name_in_two_folders_are_two_scenes(folder):
-    for name in ("a", "b"):
-        (folder / name).mkdir()
-        run("scenes", "copy", "table1", f"{name}/lab.xml")
-    estimate = ["estimate", "--paths", 64, "-o", "d/f.png"]
-    assert run(*estimate, "a/lab.xml").exit_code == 0
-    assert_refused(run(*estimate, "b/lab.xml"), "since its scene file is ../a/lab.xml")
-    assert run(*estimate, folder / "a/lab.xml").exit_code == 0
 
 
 @pytest.mark.usefixtures("small_figures")

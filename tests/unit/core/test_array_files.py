@@ -40,21 +40,10 @@ def npy(shape, version=1):
     return b"\x93NUMPY" + bytes([version, 0]) + len(text).to_bytes(2 if version == 1 else 4, "little") + text
 
 
-@each_row(
-    "data",
-    [
-        npy("(3, 4"),
-        npy("(3, -4)"),
-        npy("(3, 1e3)"),
-        npy("(3, {)"),
-        npy("(" * 200 + ")" * 200),
-        npy("(3,)", version=9),
-        npy("(10**9,)"),
-        npy("(3,)"),
-        b"\x93NUMPY",
-        b"",
-    ],
-)
+SHAPES = ("(3, 4", "(3, -4)", "(3, 1e3)", "(3, {)", "(" * 200 + ")" * 200, "(10**9,)", "(3,)")
+
+
+@each_row("data", [*map(npy, SHAPES), npy("(3,)", version=9), b"\x93NUMPY", b""])
 def test_damaged_arrays_are_refused_in_one_sentence(tmp_path, data):
     """NumPy's parser raises what Python's does: SyntaxError, TokenError, RecursionError, ..."""
     (tmp_path / "a.npy").write_bytes(data)

@@ -174,7 +174,6 @@ def default_ctrl_c():
 
 @pytest.mark.parametrize("presses", [1, 2])
 def test_an_interruption_waits_until_the_files_are_in_place(tmp_path, default_ctrl_c, presses):
-    """The second one does not."""
     (tmp_path / "a").write_text("old")
 
     def interrupted():

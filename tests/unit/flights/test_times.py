@@ -28,13 +28,7 @@ def test_systems_of_times(platform, last, system):
     assert platform_of(platform).time_system(np.array([last - 10, last])) == system
 
 
-@pytest.mark.parametrize(
-    ("platform", "last", "message"),
-    [
-        ({**CSV, "time": "utc"}, 10.0, "time = 'utc' must be one of flight, gps_week, gps, adjusted_gps"),
-        (CSV, 1.764e9, r"the times of line\.txt, up to 1764000000 s, may be Unix times, which are 315964782 s more"),
-    ],
-)
-def test_times_that_are_not_known(platform, last, message):
+def test_times_that_are_not_known():
+    message = r"the times of line\.txt, up to 1764000000 s, may be Unix times, which are 315964782 s more"
     with pytest.raises(UserError, match=message):
-        platform_of(platform).time_system(np.array([last - 10, last]))
+        platform_of(CSV).time_system(np.array([1.764e9 - 10, 1.764e9]))

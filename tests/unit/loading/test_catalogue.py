@@ -72,7 +72,6 @@ def test_copy_is_one_scene_file_with_the_data_that_it_names(folder, tmp_path):
 
 
 def test_files_of_the_guides_are_copied_with_the_data_that_they_name(tmp_path):
-    """Also with the data that a scene of a flight names."""
     for name in ("gated_target.xml", "own_receiver.toml", "semi_arc.toml", "shore.toml"):
         assert catalogue.copy_scene(name, tmp_path) == tmp_path / name
     copied = {path.name for path in tmp_path.iterdir()}

@@ -110,7 +110,8 @@ def test_a_path_within_another_path_is_refused(tmp_path):
         open_scene(stranger(tmp_path, "a.xml", text))
 
 
-def test_libraries_in_resources_of_a_dict_are_refused(tmp_path):
+def test_libraries_in_resources_of_a_dict_or_the_current_folder_are_refused(tmp_path, monkeypatch):
+    """It may be another one than that in which the process began, and Mitsuba looks there last."""
     (tmp_path / "plugins").mkdir()
     (tmp_path / "plugins" / "evil.so").write_bytes(b"not a library")
     scene = {"type": "scene", "folder": {"type": "resources", "path": str(tmp_path)}, "shape": {"type": "evil"}}
@@ -120,12 +121,6 @@ def test_libraries_in_resources_of_a_dict_are_refused(tmp_path):
             open_scene(one)
     with pytest.raises(UserError, match="path = 'nowhere' of resources must be a folder"):
         open_scene({**scene, "folder": {"type": "resources", "path": "nowhere"}})
-
-
-def test_libraries_in_the_current_folder_of_a_script_are_refused(tmp_path, monkeypatch):
-    """It may be another one than that in which the process began, and Mitsuba looks there last."""
-    (tmp_path / "plugins").mkdir()
-    (tmp_path / "plugins" / "evil.so").write_bytes(b"not a library")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=r"evil.so would run as a plugin of Mitsuba"):
         open_scene({"type": "scene", "shape": {"type": "evil"}})

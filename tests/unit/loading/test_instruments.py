@@ -50,8 +50,11 @@ def values(name):
 
 
 @each_row("name", NAMES)
-def test_every_value_has_a_source_or_is_assumed(name):
-    instrument = instruments.read_instrument(name)
+def test_every_value_that_is_needed_has_a_source_or_is_assumed(name):
+    instrument, given = instruments.read_instrument(name), values(name)
+    assert given.keys() >= NEEDED
+    assert len([key for key in given if key.startswith("divergence")]) == 1
+    assert "field_of_view_mrad" in given or "shallow_view_mrad" in given
     assert instrument.title
     listed = set(re.findall(r"^\[(\d)\]", instrument.description, re.MULTILINE))
     cited = set()
@@ -63,14 +66,6 @@ def test_every_value_has_a_source_or_is_assumed(name):
     cited |= set(re.findall(r"\[(\d)\]", re.sub(r"^\[\d\]", "", instrument.description, flags=re.MULTILINE)))
     cited |= set(re.findall(r"as in \[(\d)\]", instruments.instrument_text(name)))
     assert cited == listed
-
-
-@each_row("name", NAMES)
-def test_needed_parameters(name):
-    given = values(name)
-    assert given.keys() >= NEEDED
-    assert len([key for key in given if key.startswith("divergence")]) == 1
-    assert "field_of_view_mrad" in given or "shallow_view_mrad" in given
 
 
 @each_row("name", NAMES)
@@ -166,6 +161,19 @@ def test_unknown_instruments_are_refused(name, sentence):
         scenes.open_scene("table1", None, name)
 
 
+@each_row(
+    ("scene", "params", "sentence"),
+    [
+        ("table1", {"layout": "1x1"}, "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil"),
+        ({"type": "scene"}, None, "instrument = 'teledyne_czmil' needs an XML scene, not a dict"),
+        ("loaded", None, "not a loaded scene"),
+    ],
+)
+def test_what_an_instrument_does_not_fit_is_refused(scene, params, sentence):
+    with pytest.raises(UserError, match=sentence):
+        scenes.open_scene(mi.load_dict({"type": "scene"}) if scene == "loaded" else scene, params, "teledyne_czmil")
+
+
 def test_parameters_of_an_infrared_channel():
     """Scene, altitude and aim are shared; the lidar's own parameters are not."""
     given = {"wind_speed": 3, "altitude": 400, "pulse_fwhm_ns": 2, "time_start_ns": 9, "infrared.off_nadir_deg": 5}
@@ -180,38 +188,6 @@ def test_parameters_of_an_infrared_channel():
     for refused in (None, "riegl_vq840g", "riegl_vq880g2_infrared"):
         with pytest.raises(UserError, match=r"has no infrared channel; instruments with one are .*riegl_vq880g2"):
             instruments.with_infrared(refused, {})
-
-
-def test_parameters_that_the_instrument_replaces_are_refused():
-    sentence = "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil"
-    with pytest.raises(UserError, match=sentence):
-        scenes.open_scene("table1", {"layout": "1x1"}, "teledyne_czmil")
-
-
-def test_scenes_of_python_take_no_instrument():
-    with pytest.raises(UserError, match="instrument = 'riegl_vq840g' needs an XML scene, not a dict"):
-        scenes.open_scene({"type": "scene"}, None, "riegl_vq840g")
-    with pytest.raises(UserError, match="not a loaded scene"):
-        scenes.open_scene(mi.load_dict({"type": "scene"}), None, "riegl_vq840g")
-
-
-def table():
-    """Return the table of the instruments, and their descriptions, in Markdown."""
-    heading = ("name", "altitude (m)", "off nadir (°)", "beam (mrad)", "view (mrad)", "channels", "energy (mJ)")
-    heading = (*heading, "FWHM (ns)", "bin (ns)")
-    rows, sources = [heading, ("---",) * len(heading)], []
-    for name in NAMES:
-        instrument = instruments.read_instrument(name)
-        marked = {each.name: each.value + "*" * each.is_assumed for each in instrument.parameters if each.value}
-        beam = marked.get("divergence_mrad", marked.get("divergence_1e2_mrad"))
-        beam += " (e^-1/2)" if "divergence_mrad" in marked else " (e^-2)"
-        views = ", ".join(value for key, value in marked.items() if key.endswith("view_mrad"))
-        columns = [marked[key] for key in ("pulse_energy_mj", "pulse_fwhm_ns", "bin_width_ns")]
-        place = [marked[key] for key in ("altitude", "off_nadir_deg")]
-        rows.append((f"`{name}`", *place, beam, views, str(len(instrument.channels)), *columns))
-        sources.append(f"**`{name}`**: {instrument.title}.\n\n```text\n{instrument.description}\n```\n")
-    lines = [f"| {' | '.join(cells)} |" for cells in rows]
-    return "\n".join(lines) + "\n", "\n".join(sources)
 
 
 def test_shipped_corrections_are_of_their_instrument():

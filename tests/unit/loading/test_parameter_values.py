@@ -22,32 +22,20 @@ PARAMETERS = {
 
 
 @each_row(
-    ("name", "value"),
+    ("name", "value", "text"),
     [
-        ("bottom_depth", 8),
-        ("bottom_depth[0]", 8),
-        ("attenuation[1]", 0.5),
-        ("layer_tops[1]", 3),
-        ("scattering[1]", 0.25),
-    ],
-)
-def test_numbers_are_found_by_name(name, value):
-    assert value_of(PARAMETERS, name) == value
-
-
-@each_row(
-    ("name", "text"),
-    [
-        ("bottom_depth", "8.1"),
-        ("attenuation[1]", "0.9, 8.1"),
-        ("layer_tops[1]", "0, 8.1"),
+        ("bottom_depth", 8, "8.1"),
+        ("bottom_depth[0]", 8, "8.1"),
+        ("attenuation[1]", 0.5, "0.9, 8.1"),
+        ("layer_tops[1]", 3, "0, 8.1"),
         # One value for all layers, as a whole and in one of them.
-        ("scattering", "8.1"),
-        ("scattering[1]", "0.25, 8.1"),
+        ("scattering", 0.25, "8.1"),
+        ("scattering[1]", 0.25, "0.25, 8.1"),
     ],
 )
-def test_one_number_changes(name, text):
+def test_numbers_are_found_by_name_and_one_changes(name, value, text):
     before = dict(PARAMETERS)
+    assert value_of(PARAMETERS, name) == value
     changed = with_value(PARAMETERS, name, 8.1)
     assert changed == {**before, name.partition("[")[0]: text}
     assert before == PARAMETERS

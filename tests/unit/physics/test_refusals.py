@@ -5,6 +5,7 @@ import pytest
 from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
 from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
@@ -46,6 +47,13 @@ REFUSED = [
     (lambda: Pulse.sampled([0, 1], [0, 0]), "power must be greater than 0 somewhere"),
     (lambda: Pulse.sampled([0], [1]), r"times_ns of shape \(1,\) must be a list of at least 2"),
     (lambda: waveform(1.0, 1.0, (0, np.ones(1))), "time axis"),
+    (lambda: GateTrain(1400.0, 10.0, 5.0, 3, 6, 6.1), "must add up to at most 11.8"),
+    (
+        lambda: GateTrain(1400.0, 10.0, 5.0, 3, profile=GateShape.sampled([0, 1], [1, 1])),
+        "must be those of the profile",
+    ),
+    *((lambda g=g: GateShape.sampled([0, 1], g), "must lie between 0 and 1") for g in ([0, 1.1], [-0.1, 1])),
+    (lambda: GateShape.sampled([0, 1], [0, 0]), "greater than 0 somewhere"),
     (lambda: TimeAxis.covering(1396.2, 1552.0, 1e-5), r"bin_width_ns = 1e-05 .* at least 0\.00016"),
     (lambda: ReceiverChain(DIODE, digitiser=Digitiser(8, 1.0)), "digitiser needs an amplifier"),
     (lambda: ReceiverChain(DIODE, logarithm=LogAmplifier(0.2, 1e-3)), "logarithm needs an amplifier"),
@@ -78,10 +86,7 @@ REFUSED = [
     (lambda: SeaState(()), "components must hold at least one"),
     (lambda: SeaState((3,)), "components holds 3 but every component must be a wave spectrum"),
     (lambda: MatchedSpectrum(SwellSpectrum(1, 20), 0.1, 0.1), "spectrum = SwellSpectrum.* must be one of wind"),
-    (
-        lambda: PowerLawTable.from_function(np.ones_like).with_chi(0.001),
-        "chi_p = 0.001 makes .* negative: .* than 0.00",
-    ),
+    (lambda: PowerLawTable.from_function(np.ones_like).with_chi(0.001), "chi_p = 0.001 makes .* negative: .* than"),
     (lambda: PowerLawTable.from_values([1.0, 0.0, 1.0]), "greater than 0 at every node"),
     (lambda: PowerLawTable.from_values([1.0, np.nan]), "nan"),
     (lambda: PowerLawTable.from_values([1e30, 1.0], -20.0), "exponent must be below 1"),

@@ -24,30 +24,18 @@ REFUSED = {
     "lidar_transmitter": [
         ({"altitude": -0.05}, "altitude = -0.05 must lie between 0.1 and 1e+06, or -1000 and"),
         ({"altitude": -1.0, "off_nadir_deg": 181.0}, "must lie between 0 and 180"),
-        (
-            {"divergence_mrad": 1.0, "divergence_1e2_mrad": 2.0},
-            "divergence_mrad = 1.0 and divergence_1e2_mrad = 2.0 describe the same",
-        ),
+        ({"divergence_mrad": 1.0, "divergence_1e2_mrad": 2.0}, "divergence_mrad = 1.0 and divergence_1e2_mrad = 2.0"),
         ({"ellipse_deg": 20.0}, "ellipse_deg needs divergence_across_mrad"),
-        (
-            {"divergence_fwhm_mrad": 2.0, "divergence_across_mrad": 2.0},
-            "divergence_across_mrad goes with divergence_mrad",
-        ),
+        ({"divergence_fwhm_mrad": 2.0, "divergence_across_mrad": 2.0}, "divergence_across_mrad goes with"),
         ({"profile_mrad": 2.0}, "profile_mrad does not go with beam_profile = 'gaussian'"),
         ({"beam_profile": "image"}, "profile_file is missing"),
-        (
-            {"beam_profile": "image", "profile_file": "nowhere.npy"},
-            "profile_mrad is missing: beam_profile = 'image' needs it",
-        ),
+        ({"beam_profile": "image", "profile_file": "nowhere.npy"}, "profile_mrad is missing: beam_profile = 'image'"),
         ({"beam_profile": "image", "divergence_mrad": 5.0}, "divergence_mrad does not go with beam_profile = 'image'"),
         (
             {"beam_profile": "image", "profile_file": "nowhere.npy", "profile_mrad": 5.0},
             "profile_file = 'nowhere.npy': cannot read nowhere.npy: No such file or directory",
         ),
-        (
-            {"beam_profile": "image", "profile_file": "beam.jpg", "profile_mrad": 5.0},
-            "profile_file = 'beam.jpg': cannot read beam.jpg: the name of a grey image must end in .png, .npy, .exr",
-        ),
+        ({"beam_profile": "image", "profile_file": "beam.jpg", "profile_mrad": 5.0}, "a grey image must end in"),
         ({"pulse_file": "nowhere.txt"}, "cannot read nowhere.txt: No such file or directory"),
         ({"to_world": SHEAR}, "to_world must be a rotation"),
         ({"to_world": mi.ScalarTransform4f(), "altitude": 3.0}, "altitude = 3.0 and to_world describe the same"),
@@ -101,18 +89,12 @@ REFUSED = {
         ({"slope_variance": "2"}, "slope_variance = 2 must lie between"),
         ({"cell_size": "fine"}, "cell_size = 'fine' must be a number"),
         ({"cell_size": 0.001}, "refined_size = 32 with cell_size = 0.001 needs 32000 cells per side"),
-        (
-            {"refined_size": 2000.0, "cell_size": 0.25},
-            "refined_size = 2000 with cell_size = 0.25 needs 8000 cells per side",
-        ),
+        ({"refined_size": 2000.0, "cell_size": 0.25}, "refined_size = 2000 with cell_size = 0.25 needs 8000 cells"),
         ({"spectrum": "jonswap"}, "fetch is missing: the spectrum 'jonswap' needs it"),
         ({"fetch": 1e4, "inverse_wave_age": 2.0}, "fetch = 10000.0 and inverse_wave_age = 2.0 describe"),
         ({"spectrum": "flat", "swell_height": 1.0}, "needs a spectrum of waves, not 'flat'"),
         ({"spectrum": "height_map"}, "filename is missing"),
-        (
-            {"spectrum": "height_map", "filename": "none.npy", "map_size": 9.0},
-            "cannot read none.npy: No such file or directory",
-        ),
+        ({"spectrum": "height_map", "filename": "none.npy", "map_size": 9.0}, "cannot read none.npy: No such file or"),
     ],
     "fournier_forand": [
         ({"junge_slope": 6.0, "refractive_index": 1.1}, "junge_slope = 6 must lie between"),
@@ -130,19 +112,13 @@ REFUSED = {
         ({"layout": "hex0"}, "layout = 'hex0' must have"),
         ({"layout": "hex1049617"}, "has 1049617 pixels; allowed are at most 1048576"),
         ({"layout": "hex7", "imager": True}, "imager = True is for layouts of rows x col"),
-        (
-            {"layout": "hex7", "field_of_view_shape": "square"},
-            "field_of_view_shape = 'square' is for layouts of rows x columns: leave it out",
-        ),
+        ({"layout": "hex7", "field_of_view_shape": "square"}, "field_of_view_shape = 'square' is for layouts of rows"),
         ({"pixel_map": "a.png", "layout": "2x2"}, "layout = '2x2' and pixel_map = 'a.png'"),
         ({"pixel_map": "a.png", "fill_factor": 0.5}, "fill_factor = 0.5 and pixel_map = 'a.png'"),
         ({"blur_mrad": 1.0, "blur_file": "a.npy"}, "blur_mrad = 1.0 and blur_file = 'a.npy'"),
         ({"blur_file": "a.npy"}, "blur_file_mrad is missing"),
         ({"blur_file_mrad": 2.0}, "blur_file_mrad is the size of blur_file, which is missing"),
-        (
-            {"blur_file": "none.npy", "blur_file_mrad": 2.0},
-            "blur_file = 'none.npy': cannot read none.npy: No such file or directory",
-        ),
+        ({"blur_file": "none.npy", "blur_file_mrad": 2.0}, "blur_file = 'none.npy': cannot read none.npy: No such"),
     ],
     "sky": [({"a": {"type": "homogeneous"}}, "sky: a medium inside it would have no effect")],
     "lidar_volpat": [({}, "lidar_volpat")],
@@ -244,10 +220,7 @@ WRONG_SCENES = [
     ({"tx": {"type": "lidar_transmitter", "to_world": mi.ScalarTransform4f().translate([0, 0, -3])}}, "altitude"),
     ({"tx": {"type": "lidar_transmitter", "altitude": -3.0}}, r"at z = -3 m and 200 m must both be above the mean sea"),
     ({**UNDER_WATER, "sea": LAYERED}, "refractive_index changes with depth: a lidar under water needs one index"),
-    (
-        {**UNDER_WATER, "sea": HIGH_WAVES},
-        r"altitude = -0.2 must be below the surface of the waves, whose lowest trough",
-    ),
+    ({**UNDER_WATER, "sea": HIGH_WAVES}, r"altitude = -0.2 must be below the surface of the waves, whose lowest"),
 ]
 
 

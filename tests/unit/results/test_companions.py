@@ -3,30 +3,29 @@
 import numpy as np
 import pytest
 import xarray as xr
+from small_results import made
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results.attributes import join, split
 
 
 def result(bins, wavelength):
     """A result of two pixels and so many bins."""
-    values = np.arange(2.0 * bins).reshape(2, bins)
-    return results.build(
-        *[values] * 4,
-        time=TimeAxis(1000.0, 0.5, bins),
-        pixel_names=["left", "right"],
-        pixel_centres_mrad=np.zeros((2, 2)),
-        attributes={"wavelength_nm": wavelength, "passes": 3, "pulse_times_ns": [0.0, 1.0], "instrument": "eye"},
-    )
+    attributes = {"wavelength_nm": wavelength, "passes": 3, "pulse_times_ns": [0.0, 1.0], "instrument": "eye"}
+    return made(np.arange(2.0 * bins).reshape(2, bins), start=1000.0, names=["left", "right"], **attributes)
 
 
 def test_both_channels_are_what_they_were(tmp_path):
     green, infrared = result(9, 532.0), result(20, 1064.0)
     both = join(green, infrared)
     assert both.sizes == {"pixel": 2, "time": 9, "infrared_pixel": 2, "infrared_time": 20}
-    for dataset in (both, _saved(both, tmp_path / "both.nc")):
+    results.save(both, tmp_path / "both.nc")
+    # Other programs see a group of its own.
+    with xr.open_dataset(tmp_path / "both.nc", group="infrared", engine="h5netcdf") as group:
+        assert group.attrs["wavelength_nm"] == 1064.0
+        assert group["waveform"].shape == (2, 20)
+    for dataset in (both, results.open(tmp_path / "both.nc")):
         for own, expected in zip(split(dataset), (green, infrared), strict=True):
             xr.testing.assert_identical(own, expected)
     with pytest.raises(UserError, match=r"an EXR file holds no infrared channel; use a .nc file"):
@@ -36,15 +35,6 @@ def test_both_channels_are_what_they_were(tmp_path):
     assert none is None
     # Waveforms alone, as a program takes from both.
     assert "infrared" not in split(both[["waveform"]])[0].attrs
-
-
-def _saved(dataset, path):
-    results.save(dataset, path)
-    # Other programs see a group of its own.
-    with xr.open_dataset(path, group="infrared", engine="h5netcdf") as group:
-        assert group.attrs["wavelength_nm"] == 1064.0
-        assert group["waveform"].shape == (2, 20)
-    return results.open(path)
 
 
 def test_series_share_their_shots():

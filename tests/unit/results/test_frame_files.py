@@ -41,7 +41,6 @@ def frames():
 
 @pytest.mark.parametrize("suffix", [".nc", ".exr"])
 def test_round_trip(frames, tmp_path, suffix):
-    """All of the frames come back, integers as integers."""
     results.save(frames, tmp_path / f"frames{suffix}")
     found = results.open(tmp_path / f"frames{suffix}")
     xr.testing.assert_equal(found, frames)

@@ -5,17 +5,12 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
+from small_results import made
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.gates.cut import cut_gates
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results.geometry import (
-    LinesOfSight,
-    lidar_geometry,
-    lidar_system,
-    share_in_view,
-)
+from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, lidar_system, share_in_view
 
 C0 = 0.299792458  # m/ns
 THETA, N, GROUP = math.radians(20), 1.34, 1.364
@@ -66,15 +61,7 @@ def test_share_of_the_beam_in_view():
 def image(sights=True):
     """Return a result of 2 x 3 pixels, with lines of sight or without."""
     angles = np.stack(np.meshgrid([5.0, -5.0], [8.0, 0.0, -8.0], indexing="ij"), axis=-1).reshape(-1, 2)
-    values = np.ones((6, 100))
-    built = results.build(
-        *[values] * 4,
-        time=TimeAxis(1400.0, 1.0, 100),
-        pixel_names=[],
-        pixel_centres_mrad=angles,
-        grid=(2, 3),
-        attributes={**ATTRIBUTES, "surface_time_ns": 1420.0},
-    )
+    built = made(np.ones((6, 100)), step=1.0, grid=(2, 3), centres=angles, **ATTRIBUTES, surface_time_ns=1420.0)
     number = np.arange(6.0)
     angle, share = THETA + 1e-3 * number, number / 21
     values = (1e-3 * number, -1e-3 * number, angle, 1419 + number, 0.1 * number, 0.106 + 1e-4 * number, share)

@@ -7,31 +7,21 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy.stats import norm
+from small_results import made
 from synthetic_shots import ATTRIBUTES, SIGMA, SURFACE
 
-from mitransient_lidar import results
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.column_fits import column_fit
 from mitransient_lidar.analysis.waveforms.echo_detection import Records
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accuracy import ErrorCorrelation
 from mitransient_lidar.results.sum_errors import BlockCorrelation, SumErrors, with_correlation
 
 
 def record(values, deviation, step=1.0, **attributes):
     """A result of one pixel with these values [W] and standard errors."""
-    return results.build(
-        values[np.newaxis] * step * 1e-9,
-        deviation[np.newaxis] * step * 1e-9,
-        values[np.newaxis],
-        deviation[np.newaxis],
-        time=TimeAxis(1385.0, step, values.size),
-        pixel_names=["axis"],
-        pixel_centres_mrad=[(0.0, 0.0)],
-        attributes={**ATTRIBUTES, **attributes},
-    )
+    return made(values[None], deviation[None], start=1385.0, step=step, **{**ATTRIBUTES, **attributes})
 
 
 @pytest.mark.parametrize("bins", [1000, 1027, 1100])
@@ -44,7 +34,9 @@ def test_bins_belong_to_their_block_at_the_end_of_a_record(bins):
     middles, found = correlation.over(time)
     zero = xr.DataArray(np.ones((4, bins)), dims=("pixel", "time"))
     dataset = xr.Dataset({"waveform": zero, "waveform_stderr": zero}, {"time": time})
-    errors = SumErrors.of(with_correlation(dataset, middles, found))
+    one = with_correlation(dataset, middles, found)
+    errors, joined = SumErrors.of(one), SumErrors.of(xr.concat([one, one], "shot"))
+    np.testing.assert_allclose(joined.shared.correlation, errors.shared.correlation)
     np.testing.assert_array_equal(errors.shared.block, np.arange(bins) // -(-bins // 512))
     for count in range(2, 8):
         assert errors.of_sum(np.ones(count), np.ones(count), bins - count) == pytest.approx(count, rel=1e-5)
@@ -77,22 +69,12 @@ def test_a_record_of_very_many_bins_needs_little_memory():
     correlation = 0.9 ** np.abs(np.subtract.outer(*2 * [np.arange(blocks.size)]))
     middles = np.add.reduceat(time, blocks) / np.diff(np.append(blocks, bins))
     tracemalloc.start()
-    try:
-        dataset = with_correlation(record(values, 1e-2 * values + 1e-9, step, passes=20), middles, correlation)
-        table = echo_table.extract(dataset)
-        assert tracemalloc.get_traced_memory()[1] < 0.2e9
-    finally:
-        tracemalloc.stop()
+    dataset = with_correlation(record(values, 1e-2 * values + 1e-9, step, passes=20), middles, correlation)
+    table = echo_table.extract(dataset)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 0.2e9
     np.testing.assert_allclose(table["time_ns"].sel(echo="bottom"), SURFACE + 70, atol=0.05)
-
-
-def test_joined_results_have_the_mean_of_their_correlations():
-    correlation, time = ErrorCorrelation(), 1385.0 + np.arange(60)
-    for values in np.random.default_rng(4).normal(size=(9, 1, 60)):
-        correlation.add(values)
-    one = with_correlation(record(np.ones(60), np.ones(60)), *correlation.over(time))
-    joined = SumErrors.of(xr.concat([one, one], "shot"))
-    np.testing.assert_allclose(joined.shared.correlation, SumErrors.of(one).shared.correlation)
 
 
 def test_correlations_of_another_kind_are_refused():

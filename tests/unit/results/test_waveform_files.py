@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
+from rows import each_row
 from waveform_writers import Packets, Return, Sampling, Segment, Shot, write_las, write_pulse_waves
 
 import mitransient_lidar
@@ -185,8 +186,12 @@ def test_pulse_waves(tmp_path, appended):
         read_waveforms(tmp_path / "one.pls", channel=0)
 
 
-def las_with(path, packets=None, **options):
-    write_las(path, two_returns_each(3), packets or Packets(random_counts(3)), **options)
+def las_with(path, **options):
+    write_las(path, two_returns_each(3), Packets(random_counts(3)), **options)
+
+
+def las_of(path, **packets):
+    write_las(path, two_returns_each(3), Packets(random_counts(3), **packets))
 
 
 def cut(path, count):
@@ -203,25 +208,13 @@ WRONG_LAS = {
     "cut": (lambda path: cut(path.with_suffix(".wdp"), 5), "bad.wdp is cut: the samples of waveform 2 of .* 5 bytes"),
     "cut points": (lambda path: cut(path, 59 * 2), "bad.las is cut: it ends before the last of its 6 points"),
     "damaged": (lambda path: cut(path, path.stat().st_size - 200), "bad.las is damaged, or is not a LAS or LAZ file"),
-    "offset": (
-        lambda path: las_with(path, shift=2000),
-        "waveform 0 of .*bad.las has its samples at byte 2060 of .*wdp",
-    ),
+    "offset": (lambda path: las_with(path, shift=2000), "waveform 0 of .*bad.las has its samples at byte 2060 of"),
     "early": (lambda path: las_with(path, shift=-10), "at byte 50 of .*: the offset must lie between 60 and 299"),
     "internal offset": (lambda path: las_with(path, shift=2000, internal=True), "between 60 and 299, the last byte"),
     "descriptor": (lambda path: las_with(path, record=101), "has no descriptor 1, which waveform 0 needs"),
-    "bits": (
-        lambda path: las_with(path, Packets(random_counts(3), bits=12)),
-        "descriptor 1 of .*bad.las has 12 bits per sample: 8, 16 and 32 are read",
-    ),
-    "compressed": (
-        lambda path: las_with(path, Packets(random_counts(3), compression=1)),
-        r"descriptor 1 of .*bad.las has compressed waveforms \(type 1\), which are not read",
-    ),
-    "spacing": (
-        lambda path: las_with(path, Packets(random_counts(3), spacing_ps=0)),
-        "has 40 samples, 0 ps apart: both must be above 0",
-    ),
+    "bits": (lambda path: las_of(path, bits=12), "descriptor 1 of .*bad.las has 12 bits per sample: 8, 16 and 32 are"),
+    "compressed": (lambda path: las_of(path, compression=1), r"bad.las has compressed waveforms \(type 1\), which are"),
+    "spacing": (lambda path: las_of(path, spacing_ps=0), "has 40 samples, 0 ps apart: both must be above 0"),
     "no waveforms": (
         lambda path: laspy.LasData(laspy.LasHeader(version="1.4", point_format=6)).write(path),
         "has point format 6, without waveforms: it must be 4, 5, 9 or 10",
@@ -229,7 +222,7 @@ WRONG_LAS = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG_LAS)
+@each_row("case", WRONG_LAS)
 def test_wrong_las_files_are_refused(tmp_path, case):
     change, message = WRONG_LAS[case]
     las_with(tmp_path / "bad.las")
@@ -249,16 +242,10 @@ WRONG_PLS = {
         lambda path: path.with_suffix(".wvs").rename(path.with_suffix(".wvz")),
         "bad.wvz has compressed waveforms, which are not read",
     ),
-    "cut": (
-        lambda path: cut(path.with_suffix(".wvs"), 2),
-        "bad.wvs is cut: the samples of pulse 1 of .* 2 bytes after",
-    ),
+    "cut": (lambda path: cut(path.with_suffix(".wvs"), 2), "bad.wvs is cut: the samples of pulse 1 .* 2 bytes after"),
     "cut pulses": (lambda path: cut(path, 150), "bad.pls is cut: it ends before the last of its 2 pulses"),
     "no records": (lambda path: cut(path, 40), "bad.pls is damaged, or is not a PulseWaves file"),
-    "no waves": (
-        lambda path: path.with_suffix(".wvs").write_bytes(bytes(100)),
-        "bad.wvs is damaged, or is not a PulseWaves file",
-    ),
+    "no waves": (lambda path: path.with_suffix(".wvs").write_bytes(bytes(100)), "bad.wvs is damaged, or is not a"),
     "offset": (lambda path: pls_with(path, shift=500), "pulse 0 of .*bad.pls has its samples at byte 560 of .*bad.wvs"),
     "descriptor": (lambda path: pls_with(path, index=3), "has no descriptor 3, which pulse 0 needs"),
     "bits": (lambda path: pls_with(path, Sampling(bits=12)), "descriptor 1 of .*bad.pls has 12 bits per sample"),
@@ -269,7 +256,7 @@ WRONG_PLS = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG_PLS)
+@each_row("case", WRONG_PLS)
 def test_wrong_pulse_waves_files_are_refused(tmp_path, case):
     change, message = WRONG_PLS[case]
     pls_with(tmp_path / "bad.pls")
@@ -346,7 +333,6 @@ def test_echoes_of_a_file(tmp_path):
 
 
 def test_commands_take_files(tmp_path):
-    """Parts of a file, in compare and view; what is missing, in one sentence."""
     water_file(tmp_path / "sea.las")
     same = run("compare", tmp_path / "sea.las", tmp_path / "sea.las", "-o", tmp_path / "same.png")
     assert same.stdout.splitlines()[1].startswith("agree: 240 bins, rms 0.00"), same.stderr

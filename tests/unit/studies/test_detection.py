@@ -1,10 +1,10 @@
 """Performance of detection: needed signals, drawn shots, depths, tables, drawings and the command, without renders."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import assert_refused, run, stub
-from PIL import Image
 from scipy.stats import norm, t
 from significance import largest_z
 
@@ -108,27 +108,12 @@ def test_drawn_shots_have_the_expected_rates():
             error = np.sqrt(expected * (1 - expected) / shots)
             assert abs(found[name][1][row, at] - expected) < largest_z(shots, 8) * error
     assert found["expected_detection"][1][-1][at] == pytest.approx(0.9, abs=1e-3)
+    # The target whose whole signal is that share is detected as often.
+    whole = trials.detected(replace(light, difference=share * light.difference), 0.05)["detection"][1]
+    np.testing.assert_allclose(whole, [row[at] for row in found["expected_detection"][1]], atol=1e-3)
     # Rates and area agree: the best weighting beats one pixel far beyond the intervals.
     assert found["area_low"][1][3] > found["area_high"][1][0]
     assert np.all(np.abs(found["area"][1] - found["expected_area"][1]) < 0.03)
-
-
-@pytest.mark.slow
-def test_probability_of_detection_is_the_rate_of_drawn_shots():
-    """Four pixels of noise like that of the echoes: shots with the full signal above the threshold without it."""
-    light = experiment(levels=(2, 2, 1, 0.5), echoes=(0, 1, 2, 1.2), chain=NOISY, photons=2e4, scatter=0.0)
-    found = trials.detected(light, 0.02)
-    shots = 20_000
-    random = trials.drawn(light, 1.0, 0.02, shots, 3)
-    at = int(np.flatnonzero(random["false_alarm"][1] == 0.02)[0])
-    combined, alone = found["detection"][1], found["pixel_detection"][1]
-    error = np.sqrt(combined * (1 - combined) / shots)
-    assert np.max(np.abs(random["drawn_detection"][1][:, at] - combined) / error) < largest_z(shots, 4)
-    assert np.all((combined > 0.03) & (combined < 0.97))
-    # The pixel without an echo raises false alarms alone, and the brightest is one of the pixels.
-    assert alone[0] == pytest.approx(0.02)
-    assert alone[2] == pytest.approx(combined[2])
-    assert combined[3] > max(alone)
 
 
 def test_interval_of_detection_is_that_of_the_scatter_of_renders():
@@ -139,6 +124,26 @@ def test_interval_of_detection_is_that_of_the_scatter_of_renders():
     factors = light.difference[:, 2, 20] / light.difference[:, 2, 20].mean()
     reach = t.ppf(0.975, 5) * factors.std(ddof=1) / np.sqrt(6)
     np.testing.assert_allclose([low / value, high / value], [1 - reach, 1 + reach], rtol=0.02)
+    # The pixels without an echo raise false alarms alone, and the brightest is one of the pixels.
+    alone, combined = found["pixel_detection"][1], found["detection"][1]
+    np.testing.assert_allclose(alone[[0, 1, 3]], 0.02)
+    assert alone[2] == pytest.approx(combined[2])
+
+
+@pytest.fixture(scope="module")
+def result():
+    """A result as of `detect`, from synthetic light."""
+    light = experiment(levels=(2, 2, 1, 0.5), echoes=(0, 0.2, 1, 0.5))
+    data = trials.needs(light, 1e-3, 0.9) | trials.detected(light, 1e-3)
+    share = float(data["needed_target"][1][-1])
+    data |= trials.drawn(light, share, 1e-3, 200, 1) | trials.depth_errors(light, 200, 1, PULSE_NS, 0.11)
+    data |= trials.by_depth([light, experiment(photons=1.0)], [4.0, 8.0], 1e-3, 0.9)
+    for name, values in (("background", light.background), ("difference", light.difference)):
+        data[name] = (("pixel", "time"), values.mean(axis=0), {"units": "W"})
+    coords = {"combination": list(COMBINATIONS), "pixel": NAMES, "time": 0.5 + T}
+    attributes = {"scene": "made_up", "receiver": "apd", "pfa": 1e-3, "pd": 0.9, "shots": 200, "clutter": 0}
+    attributes |= {"drawn_share": share, "confidence": 0.95, "brightest": "blue", "gain_pixels": 1.0}
+    return xr.Dataset(data, coords, {**attributes, "gain_single": 0.5, "pulse_fwhm_ns": PULSE_NS})
 
 
 @pytest.mark.slow
@@ -148,10 +153,14 @@ def test_sentence_answers_whether_the_target_is_detected(result, pd, verdict):
     shown["detection"], shown["detection_low"], shown["detection_high"] = (
         ("combination", [0.5, 0.4, 0.6, value]) for value in (0.92, 0.85, 0.97)
     )
-    text = detection.describe_detection(shown)[0]
+    text, *lines = detection.describe_detection(shown)
     assert text.startswith(f"{verdict}: P_d = 0.92 (0.85 .. 0.97) with the best weighting")
     assert "one pixel for all light 0.5" in text
     assert all(f"{name} " in text for name in NAMES)
+    rows = [line.split()[0] for line in lines]
+    assert [rows.count(name) for name in COMBINATIONS] == [3, 3, 3, 3]
+    best = next(line for line in lines if line.startswith("best"))
+    assert f"{100 * float(result['needed_target'][3]):.3g} (" in best
 
 
 @pytest.mark.slow
@@ -187,53 +196,6 @@ def test_detectable_depth_is_where_the_whole_signal_suffices(monkeypatch):
     assert 5 - low[0] == pytest.approx(t.ppf(0.975, 2) * error)
     assert np.isnan(reached[3])
     assert found["needed_at_depth"][1][0, 1] == pytest.approx(np.exp(3))
-
-
-def made_up(depths=True):
-    """Return a result as of `detect`, from synthetic light."""
-    light = experiment(levels=(2, 2, 1, 0.5), echoes=(0, 0.2, 1, 0.5))
-    data = trials.needs(light, 1e-3, 0.9)
-    data |= trials.detected(light, 1e-3)
-    data |= trials.drawn(light, float(data["needed_target"][1][-1]), 1e-3, 200, 1)
-    data |= trials.depth_errors(light, 200, 1, PULSE_NS, 0.11)
-    if depths:
-        data |= trials.by_depth([light, experiment(photons=1.0)], [4.0, 8.0], 1e-3, 0.9)
-    for name, values in (("background", light.background), ("difference", light.difference)):
-        data[name] = (("pixel", "time"), values.mean(axis=0), {"units": "W"})
-    coords = {"combination": list(COMBINATIONS), "pixel": NAMES, "time": 0.5 + T}
-    attributes = {"scene": "made_up", "receiver": "apd", "pfa": 1e-3, "pd": 0.9, "shots": 200, "clutter": 0}
-    attributes |= {"drawn_share": float(data["needed_target"][1][-1]), "confidence": 0.95, "brightest": "blue"}
-    attributes |= {"gain_pixels": 1.0, "gain_single": 0.5}
-    return xr.Dataset(data, coords, {**attributes, "pulse_fwhm_ns": PULSE_NS})
-
-
-@pytest.fixture(scope="module")
-def result():
-    return made_up()
-
-
-@pytest.mark.slow
-def test_table_lists_all(result):
-    lines = detection.describe_detection(result)
-    rows = [line.split()[0] for line in lines]
-    assert [rows.count(name) for name in COMBINATIONS] == [3, 3, 3, 3]
-    best = next(line for line in lines if line.startswith("best"))
-    assert f"{100 * float(result['needed_target'][3]):.3g} (" in best
-
-
-@pytest.mark.slow
-def test_command_writes_and_prints(result, tmp_path, monkeypatch):
-    asked = {}
-    stub(monkeypatch, "detect", lambda **options: asked.update(options) or result)
-    plot = tmp_path / "new" / "detection.png"
-    done = run("detect", "fig13_2x2", "--depths", "4,8", "--pfa", 0.01, "-o", plot, "-q")
-    assert done.exit_code == 0, done.stderr
-    assert done.stdout.splitlines()[:2] == [str(plot), str(plot.with_suffix(".nc"))]
-    assert (asked["depths"], asked["pfa"], asked["receiver"]) == ([4, 8], 0.01, "apd")
-    with Image.open(plot) as picture:
-        assert picture.format == "PNG"
-    with xr.open_dataset(plot.with_suffix(".nc"), engine="h5netcdf") as kept:
-        np.testing.assert_array_equal(kept["needed_target"], result["needed_target"])
 
 
 @pytest.mark.slow
@@ -297,14 +259,8 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
     # Ten meshes are made, of which nothing is rendered.
     coarse = {"surface_size": 60, "surface_cell_size": 0.5}
     count = {"clutter": 4, "shots": 200, "receiver": "ideal"}
-    found = detection.detect(
-        "fig13_2x2",
-        coarse,
-        depths=(7, 7.5),
-        max_time=5,
-        progress=lambda state: done.append((state.done, state.planned)),
-        **count,
-    )
+    count |= {"progress": lambda state: done.append((state.done, state.planned))}
+    found = detection.detect("fig13_2x2", coarse, depths=(7, 7.5), max_time=5, **count)
     assert [(seed, depth) for seed, depth, _ in asked] == [(9 + i, d) for d in (8, 7) for i in range(4)]
     # The same random numbers at each depth, others for each sea.
     assert len({seed for *_, seed in asked}) == 4
@@ -336,14 +292,14 @@ def test_images_of_a_camera_are_filtered(monkeypatch, tmp_path, clutter):
         dims = ("row", "column", "gate")
         data = {"gate_light": (("kind", "half", *dims), np.maximum(both, 0)), "gate_energy": (dims, both[0, 0])}
         start, depth = 1450 + 3.0 * np.arange(5), 4.33 + 0.33 * np.arange(5)
-        coords = {
-            **dict.fromkeys(dims[:2], np.arange(8)),
-            "gate": np.arange(5),
+        coords = {name: (dims[:2], random.normal(size=(8, 8))) for name in ("angle_x", "angle_y")}
+        coords |= {
             "gate_start": ("gate", start),
             "gate_depth": ("gate", depth),
+            "gate_width": ("gate", np.full(5, 6.0)),
         }
-        angles = {name: (dims[:2], random.normal(size=(8, 8))) for name in ("angle_x", "angle_y")}
-        stack = xr.Dataset(data, {**coords, "gate_width": ("gate", np.full(5, 6.0)), **angles}, {"gate_step_ns": 3.0})
+        coords |= {"row": np.arange(8), "column": np.arange(8), "gate": np.arange(5)}
+        stack = xr.Dataset(data, coords, {"gate_step_ns": 3.0})
         return stack.assign(gate_energy_stderr=0 * stack["gate_energy"])
 
     monkeypatch.setattr(detection, "target_gates", gates)
@@ -370,54 +326,20 @@ def test_images_of_a_camera_are_filtered(monkeypatch, tmp_path, clutter):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene", "params", "receiver", "message"),
+    ("late", "receiver", "message"),
     [
-        ("fig02_mine", GATES, "apd", "the scene is an image of 8x8: it needs gates and a camera (iccd, "),
-        ("fig02_mine", {}, "icmos", "scene fig02_mine has no gates, which a camera needs"),
+        # A dead time of 30 ns, which the first of a million photons starts.
+        (0, "spad", "receiver spad does not see the target"),
+        (15, "apd", r"the record must hold 1\.5 pulse widths about the target's echo at 35\.5 ns"),
     ],
 )
-def test_cameras_and_gates_go_together(scene, params, receiver, message):
-    with pytest.raises(UserError) as refused:
-        detection.detect(scene, params, receiver=receiver)
-    assert message in str(refused.value)
-
-
-@pytest.mark.slow
-def test_blind_receiver_is_reported(monkeypatch):
-    """A counter with a dead time of 30 ns, which the first of a million photons starts, counts no echo at 20 ns."""
+def test_echoes_that_are_not_recorded_are_reported(monkeypatch, late, receiver, message):
     light = experiment()
-    data = {"background": light.background[0], "difference": light.difference[0]}
+    data = {"background": light.background[0], "difference": np.roll(light.difference[0], late, axis=-1)}
     record = xr.Dataset({name: (("pixel", "time"), values) for name, values in data.items()}, {"time": 0.5 + T})
     monkeypatch.setattr(detection, "target_signal", lambda *_, **__: record)
-    with pytest.raises(UserError, match="receiver spad does not see the target"):
-        detection.detect("fig13_2x2", renders=3, receiver="spad")
-
-
-@pytest.mark.slow
-def test_echo_outside_the_record_is_reported(monkeypatch):
-    light = experiment()
-    data = {"background": light.background[0], "difference": np.roll(light.difference[0], 15, axis=-1)}
-    late = xr.Dataset({name: (("pixel", "time"), values) for name, values in data.items()}, {"time": 0.5 + T})
-    monkeypatch.setattr(detection, "target_signal", lambda *_, **__: late)
-    with pytest.raises(UserError, match=r"the record must hold 1\.5 pulse widths about the target's echo at 35\.5 ns"):
-        detection.detect("fig13_2x2", renders=3)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("fig13_2x2", "--pfa", 0.1, "--pd", 0.1), "pd = 0.1 must lie between"),
-        (("fig13_2x2", "--clutter", 2), "clutter = 2 must be 0 or lie between 4 and 1000"),
-        (("fig13_2x2", "--depths", "4;8"), "--depths = '4;8' must hold numbers only"),
-        (("fig13_2x2", "-o", "a.txt"), "must end in .png"),
-        (
-            ("fig13_2x2", "-q", "--receiver", "eye"),
-            "receiver = 'eye' must be one of ideal, photodiode",
-        ),
-    ],
-)
-def test_invalid_options_end_with_one_sentence(arguments, message):
-    assert_refused(run("detect", *arguments), message)
+    with pytest.raises(UserError, match=message):
+        detection.detect("fig13_2x2", renders=3, receiver=receiver)
 
 
 @pytest.mark.slow
@@ -428,6 +350,8 @@ def test_invalid_options_end_with_one_sentence(arguments, message):
         ("fig09_2x2", {}, {"depths": (4, 8)}, "scene fig09_2x2 has no parameter target_depth, which depths needs"),
         ("fig13_2x2", {"spectrum": "flat"}, {"clutter": 4}, "clutter needs waves"),
         ({}, None, {"clutter": 4}, "depths and clutter need an XML scene"),
+        ("fig02_mine", GATES, {"receiver": "apd"}, r"is an image of 8x8: it needs gates and a camera \(iccd, "),
+        ("fig02_mine", {}, {"receiver": "icmos"}, "scene fig02_mine has no gates, which a camera needs"),
     ],
 )
 def test_mistakes_are_reported_before_rendering(scene, params, options, message):

@@ -113,24 +113,17 @@ def test_sentences_of_the_extremes(site, options, sentence, tables):
         ("0.1:0.3", {}, "must be deeper than 0.5 m somewhere, but is 0.3 m deep"),
         ("1:3", {"kd": 0.1, "secchi": 5}, "secchi = 5 and kd = 0.1 are alternatives: give one of them"),
         ("1:3", {"kd": "map.tif"}, "must be a number, unless the site is a map"),
-        ("1:3", {"kd": -1}, "kd"),
         ("1:3", {"params": {"bottom_depth": 2}}, "parameter bottom_depth follows from the site: leave it out"),
+        ("1:3", {"instrument": "riegl_vq880g2_infrared"}, "has wavelength_nm = 1064: forecasts are of green light"),
+        ("map", {"kd": "far"}, "must cover cells of the site that are deeper than"),
     ],
 )
-def test_refusals(site, options, message, tables):
-    with pytest.raises(UserError, match=message.replace("(", r"\(")):
-        forecast("riegl_vq840g", site, **options)
-
-
-def test_other_light_is_refused(tables):
-    with pytest.raises(UserError, match="has wavelength_nm = 1064: forecasts are of green light"):
-        forecast("riegl_vq880g2_infrared", "1:3")
-
-
-def test_maps_elsewhere_are_refused(tables, site, tmp_path):
-    far = geotiff(tmp_path / "far.tif", [[0.1, 0.1], [0.1, 0.1]], corner=(600000.0, 6500000.0))
-    with pytest.raises(UserError, match="must cover cells of the site that are deeper than"):
-        forecast("riegl_vq840g", site[0], kd=far)
+def test_refusals(site, options, message, tables, tmp_path):
+    if site == "map":
+        site = geotiff(tmp_path / "site.tif", [[-4.0, -6.0], [-8.0, -12.0]])
+        options = {"kd": geotiff(tmp_path / "far.tif", [[0.1, 0.1], [0.1, 0.1]], corner=(600000.0, 6500000.0))}
+    with pytest.raises(UserError, match=message):
+        forecast(**{"instrument": "riegl_vq840g", "site": site, **options})
 
 
 @pytest.mark.slow
@@ -143,8 +136,6 @@ def test_raised_bottoms_have_the_light_of_their_depth():
     energy = [float(series["impulse_response"].sum()) for series in (one, other)]
     assert energy[0] == pytest.approx(energy[1], rel=0.02)
     time = [series["waveform"].sum("pixel") for series in (one, other)]
-    late = [series.isel(time=series["time"] > 1370).mean("shot") for series in time]
-    del late
     echo = [float(series.mean("shot").idxmax("time")) for series in time]
     assert abs(echo[0] - echo[1]) < 1.5
 

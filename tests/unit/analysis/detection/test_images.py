@@ -16,20 +16,10 @@ from mitransient_lidar.physics.receiver.camera import Camera
 PHOTON = 6.62607015e-34 * 299792458 / 532e-9  # [J]
 SIZE, GATES, PULSES = 16, 6, 200
 #: Kind of camera, and photons of the first gate in a pixel for which the detection is neither 0 nor 1.
+INTENSIFIED = {"kind": "intensified", "quantum_efficiency": 0.2, "gain": 100.0, "excess_noise": 1.8}
+INTENSIFIED |= {"intensifier_mtf": 0.3, "read_noise": 8.0, "electrons_per_dn": 4.0, "offset_dn": 100.0}
 CAMERAS = {
-    "intensified": (
-        Camera(
-            kind="intensified",
-            quantum_efficiency=0.2,
-            gain=100.0,
-            excess_noise=1.8,
-            intensifier_mtf=0.3,
-            read_noise=8.0,
-            electrons_per_dn=4.0,
-            offset_dn=100.0,
-        ),
-        30,
-    ),
+    "intensified": (Camera(**INTENSIFIED), 30),
     "counting": (Camera(kind="counting", quantum_efficiency=0.3, open_dark_hz=1e3, bits=8), 12),
     "direct": (Camera(kind="direct", quantum_efficiency=0.6, read_noise=5.0, offset_dn=100.0), 30),
 }

@@ -14,6 +14,7 @@ def test_rates_have_the_published_intervals():
     np.testing.assert_allclose(found.rate, [0, 0.5, 1])
     np.testing.assert_allclose(found.low, [0, 0.1871, 0.6915], atol=5e-5)
     np.testing.assert_allclose(found.high, [0.3085, 0.8129, 1], atol=5e-5)
+    np.testing.assert_array_equal(exceedance([3.0, 1.0, 2.0, 2.0], [0.0, 2.0, 9.0]).rate, [1, 0.25, 0])
 
 
 @pytest.mark.parametrize("truth", [0.001, 0.1, 0.5])
@@ -25,19 +26,12 @@ def test_rates_are_covered_at_least_as_often_as_said(truth):
     assert 0.9 <= share < 1 - 0.05 * (truth > 0.01)
 
 
-def test_exceedance_counts_what_is_above():
-    found = exceedance([3.0, 1.0, 2.0, 2.0], [0.0, 2.0, 9.0])
-    np.testing.assert_array_equal(found.rate, [1, 0.25, 0])
-
-
 def test_area_of_five_shots_by_hand():
     """Of six pairs (1, 2) alone is wrong; the components are 1/2, 1, 1 with the target, and 1, 2/3 without it."""
     found = area_under_curve([0, 2], [1, 3, 4])
     assert found.value == pytest.approx(5 / 6)
     assert found.stderr == pytest.approx(np.sqrt((1 / 12) / 3 + (1 / 18) / 2))
-
-
-def test_ties_count_half():
+    # Ties count half.
     assert area_under_curve([1, 1, 2], [1, 2]).value == pytest.approx((0.5 + 0.5 + 0 + 1 + 1 + 0.5) / 6)
 
 

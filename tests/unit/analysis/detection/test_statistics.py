@@ -1,9 +1,8 @@
 """Known echoes in noise and clutter: moments of samples, best weights, performance and times."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from rows import each_row
 from scipy.stats import chi2, norm, pearson3
 from significance import FALSE_ALARM, largest_z
 
@@ -70,19 +69,8 @@ def test_range_is_kept_by_less_gain():
     assert strong.amplifier.transimpedance_ohm < 0.5 * chain.amplifier.transimpedance_ohm
     assert np.max(strong.expected(100 * LIGHT, 1.0).saturation[GATE]) < 1e-8
     # Only as much less as it takes: two tenths more saturate.
-    more = replace(
-        strong, amplifier=replace(strong.amplifier, transimpedance_ohm=1.2 * strong.amplifier.transimpedance_ohm)
-    )
-    assert np.max(more.expected(100 * LIGHT, 1.0).saturation[GATE]) > 1e-4
+    assert np.max(strong.with_gain(1.2).expected(100 * LIGHT, 1.0).saturation[GATE]) > 1e-4
     assert within_range(RECEIVERS["ideal"], 100 * LIGHT, 1.0, GATE) is RECEIVERS["ideal"]
-
-
-def test_weights_subtract_what_is_correlated():
-    """C^-1 (1, 0) of a correlation r is (1, -r)/(1 - r^2), the square of its signal-to-noise ratio 1/(1 - r^2)."""
-    covariance = np.array([[1.0, 0.6], [0.6, 1.0]])
-    weights = matched_weights(np.array([1.0, 0.0]), covariance)
-    np.testing.assert_allclose(weights, [1, -0.6])
-    assert 1 / (weights @ covariance @ weights) == pytest.approx(1 / (1 - 0.36))
 
 
 def one_case(rise, covariance, factor=1.0):
@@ -112,6 +100,7 @@ def test_no_other_weights_do_better():
     random = np.random.default_rng(1)
     root = random.normal(size=(5, 5))
     covariance, rise = root @ root.T, random.normal(size=5)
+    assert matched_weights(np.array([1.0, 0.0]), np.array([[1.0, 0.6], [0.6, 1.0]])) == pytest.approx([1, -0.6])
     best = one_case(rise, covariance).statistic().deflection
     assert best == pytest.approx(np.sqrt(rise @ np.linalg.inv(covariance) @ rise))
     for weights in random.normal(size=(500, 5)):
@@ -188,7 +177,7 @@ def test_delays_reach_the_bound():
     assert 0.97 * low < found.var(ddof=1) / bound**2 < 1.03 * high
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("call", "message"),
     [
         (lambda: sample_moments(RECEIVERS["apd"], -LIGHT, 1.0, GATE), "must not be negative"),

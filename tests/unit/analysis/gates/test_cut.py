@@ -9,8 +9,8 @@ from oracles.gates import transmission
 from rows import each_row
 from scipy.integrate import quad
 from scipy.stats import norm
+from small_results import made
 
-from mitransient_lidar import results
 from mitransient_lidar.analysis.gates import cut as gating
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
@@ -43,17 +43,9 @@ def record(scale=(1.0, 2.0, 0.5), grid=None, relative=0.02, attributes=None, val
     edges = START + WIDTH * np.arange(BINS + 1)
     mean = [quad(power, low, high)[0] / WIDTH for low, high in pairwise(edges)]
     waveform = np.outer(scale, mean) if values is None else values
-    return results.build(
-        waveform * WIDTH * 1e-9,
-        relative * np.abs(waveform) * WIDTH * 1e-9,
-        waveform,
-        relative * np.abs(waveform),
-        time=TimeAxis(START, WIDTH, waveform.shape[1]),
-        pixel_names=[f"p{i}" for i in range(len(waveform))],
-        pixel_centres_mrad=np.arange(2.0 * len(waveform)).reshape(-1, 2),
-        grid=grid,
-        attributes=GEOMETRY if attributes is None else attributes,
-    )
+    places = {"centres": np.arange(2.0 * len(waveform)).reshape(-1, 2), "grid": grid}
+    about = GEOMETRY if attributes is None else attributes
+    return made(waveform, relative * np.abs(waveform), start=START, step=WIDTH, **places, **about)
 
 
 @pytest.mark.parametrize(
@@ -72,16 +64,9 @@ def test_gates_integrate_the_waveform(train):
     for gate in range(0, train.count, 4):
         low, high = train.spans_ns[gate]
         points = np.unique(np.r_[train.starts_ns[gate], train.starts_ns[gate] + train.width_ns, 1420, 1490])
-        joules = (
-            1e-9
-            * quad(
-                lambda t, gate=gate: float(power(t) * transmission(train.shape, t - train.starts_ns[gate])),
-                low,
-                high,
-                points=[p for p in points if low < p < high],
-                limit=400,
-            )[0]
-        )
+        inside = {"points": [p for p in points if low < p < high], "limit": 400}
+        opened = lambda t, gate=gate: float(power(t) * transmission(train.shape, t - train.starts_ns[gate]))  # noqa: E731
+        joules = 1e-9 * quad(opened, low, high, **inside)[0]
         # Within a bin with a sharp edge, the record has only the mean: 0.5 ns of a 5 ns echo.
         np.testing.assert_allclose(stack["gate_energy"][:, gate], np.array([1, 2, 0.5]) * joules, rtol=4e-3)
         if train.width_ns == 10:
@@ -96,19 +81,14 @@ def test_contiguous_sharp_gates_sum_to_the_record():
         np.testing.assert_allclose(gating.cut_gates(dataset, train)["gate_energy"].sum("gate"), total, rtol=1e-12)
 
 
-def test_pulses_add_up():
-    one = gating.cut_gates(record(), GateTrain(1420.0, 5.0, 5.0, 4))
-    many = gating.cut_gates(record(), GateTrain(1420.0, 5.0, 5.0, 4, pulses=1000))
-    # The mean of the render grows with the pulses, and so does its error.
-    np.testing.assert_allclose(many["gate_energy"], 1000 * one["gate_energy"], rtol=1e-12)
-    np.testing.assert_allclose(many["gate_energy_stderr"], 1000 * one["gate_energy_stderr"], rtol=1e-12)
-    assert many.attrs["pulses"] == 1000
-
-
-def test_error_without_inflation_is_the_upper_bound(caplog):
+def test_pulses_add_up_and_errors_without_inflation_are_upper_bounds(caplog):
+    train = {"start_ns": 1420.0, "width_ns": 5.0, "step_ns": 5.0, "count": 4}
     with caplog.at_level(logging.INFO, logger="mitransient_lidar"):
-        stack = gating.cut_gates(record(relative=0.03), GateTrain(1425.0, 10.0, 10.0, 3))
-    np.testing.assert_allclose(stack["gate_energy_stderr"], 0.03 * stack["gate_energy"], rtol=1e-12)
+        one, many = (gating.cut_gates(record(relative=0.03), GateTrain(**train, pulses=n)) for n in (1, 1000))
+    np.testing.assert_allclose(many["gate_energy"], 1000 * one["gate_energy"], rtol=1e-12)
+    assert many.attrs["pulses"] == 1000
+    for stack in (one, many):
+        np.testing.assert_allclose(stack["gate_energy_stderr"], 0.03 * stack["gate_energy"], rtol=1e-12)
     assert "upper bounds" in caplog.text
 
 
@@ -164,18 +144,8 @@ def test_nan_stays_in_its_gates():
 @each_row(
     ("train", "message"),
     [
-        (
-            GateTrain(1390.0, 5.0, 5.0, 2),
-            r"gate train before the surface: .* closes at 1400\.0 ns.* arrives at 1420\.0 ns",
-        ),
-        (
-            GateTrain(1402.0, 5.0, 5.0, 3),
-            r"gate train before the surface: .* closes at 1417\.0 ns.* arrives at 1420\.0 ns",
-        ),
-        (
-            GateTrain(1530.0, 5.0, 5.0, 3),
-            r"gate 0 is open from 1530\.0 to 1535\.0 ns.* within the record, 1400\.0 to 1520",
-        ),
+        (GateTrain(1402.0, 5.0, 5.0, 3), r"before the surface: .* closes at 1417\.0 ns.* arrives at 1420\.0 ns"),
+        (GateTrain(1530.0, 5.0, 5.0, 3), r"gate 0 is open from 1530\.0 to 1535\.0 ns.* the record, 1400\.0 to 1520"),
         (GateTrain(1500.0, 5.0, 5.0, 5), r"gate 4 is open from 1520\.0 to 1525\.0"),
         (GateTrain(1399.9, 5.0, 5.0, 9), r"gate 0 is open from 1399\.9"),
         # Half heights within the record, the edge outside
@@ -209,12 +179,8 @@ def test_train_from_options(tmp_path):
         {"altitude": -3.0, "group_index": 1.364}, start_range_m=2.0, width_ns=6.0, jitter_ns=0.5
     )
     assert wet.start_ns == pytest.approx(2 * 2.0 * 1.364 / 0.299792458)
-    assert (
-        gate_stack.build_gates(np.zeros((1, 1)), np.zeros((1, 1)), wet, coords={"pixel": ["a"]}, attributes={}).attrs[
-            "gate_jitter_ns"
-        ]
-        == 0.5
-    )
+    empty = gate_stack.build_gates(*np.zeros((2, 1, 1)), wet, coords={"pixel": ["a"]}, attributes={})
+    assert empty.attrs["gate_jitter_ns"] == 0.5
     path = tmp_path / "gate.txt"
     path.write_text("0 0\n1 1\n3 0\n")
     measured = gate_stack.train_from_options(GEOMETRY, start_ns=1430.0, profile_file=path, count=2)
@@ -256,8 +222,6 @@ def test_gates_narrower_than_bins_are_cut_with_a_warning_of_the_error(caplog):
         ({"start_ns": 1.0, "width_ns": 5.0, "profile_file": "gate.txt"}, "one shape"),
         ({"start_ns": 1.0, "profile_file": "gate.txt", "rise_ns": 2.0}, "must be 0 with a profile"),
         ({"start_ns": 1.0, "profile_file": "missing.txt"}, r"cannot read missing\.txt: No such file"),
-        ({"start_ns": 1.0, "width_ns": -5.0}, "width_ns = -5 must be greater than 0"),
-        ({"start_ns": 1.0, "width_ns": 5.0, "count": 0}, "count = 0 must lie between 1 and"),
     ],
 )
 def test_options_that_do_not_go_together(options, message):

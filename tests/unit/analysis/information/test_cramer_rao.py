@@ -31,9 +31,6 @@ def test_a_matrix_that_noise_makes_indefinite_is_no_degeneracy():
     assert np.isinf(found.bound).all()
     (remark,) = found.remarks
     assert remark.startswith("the noise of the render hides what the record tells about a and b (eigenvalue -0.1")
-
-
-def test_no_information_at_all():
     found = bounds(np.zeros((2, 2)), ["a", "b"])
     assert np.isinf(found.bound).all()
     assert found.remarks == [f"{name} has no influence on the record: no bound" for name in "ab"]

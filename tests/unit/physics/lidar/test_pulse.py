@@ -105,7 +105,6 @@ def test_waveform_of_one_echo():
 
 @pytest.mark.parametrize("longest_direct", [2000, 0])
 def test_waveform_matches_direct_sum_within_the_record(longest_direct, monkeypatch):
-    """By direct sums and Fourier transforms."""
     monkeypatch.setattr(pulse, "_LONGEST_DIRECT", longest_direct)
     rng = np.random.default_rng(5)
     energy = rng.random((3, 20))

@@ -373,7 +373,6 @@ def test_declared_holes_are_refused_or_filled(tmp_path, kind, content, options):
 
 
 def test_a_deep_sea_is_no_missing_value(tmp_path):
-    """Depths about 9999 m, as in a trench, are depths."""
     values = -9999.0 + 10 * HEIGHTS + 50
     values[0, 0] = -9999.0
     assert read(tmp_path, "tif", Content(values)).heights.min() == -9999

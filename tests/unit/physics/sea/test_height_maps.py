@@ -71,13 +71,10 @@ def test_netcdf_with_coordinates_in_either_order(tmp_path, name, dims):
     more = {"mask": (dims, np.zeros(values.shape))} if name != "sea" else {"time": ((), 1.0)}
     path = write_netcdf(tmp_path / "map.nc", values, dims, name, {"x": X, "y": Y}, **more)
     assert_is_the_map(read_height_map(path))
-
-
-def test_netcdf_without_coordinates_needs_a_size(tmp_path):
-    path = write_netcdf(tmp_path / "map.nc", HEIGHTS, ("row", "column"))
-    assert_is_the_map(read_height_map(path, 6.0), y=[-2, 0, 2])
+    bare = write_netcdf(tmp_path / "map.nc", HEIGHTS, ("row", "column"))
+    assert_is_the_map(read_height_map(bare, 6.0), y=[-2, 0, 2])
     with pytest.raises(ValueError, match=r"map.nc has no positions of its heights: give the size"):
-        read_height_map(path)
+        read_height_map(bare)
 
 
 def test_sample_returns_the_map_at_its_points_and_planes_between():
@@ -87,14 +84,9 @@ def test_sample_returns_the_map_at_its_points_and_planes_between():
     np.testing.assert_array_equal(surface.sample(x, y), surface.heights)
     east, north = np.array([-2.9, 0.3, 3.99]), np.array([10.0, 10.2, 11.99, 12])
     np.testing.assert_allclose(surface.sample(east, north), 2 + 3 * east - north[:, None] + east * north[:, None])
-
-
-def test_sample_outside_has_the_height_of_the_nearest_point_of_the_edge():
-    surface = HeightMap(HEIGHTS, X, Y)
-    np.testing.assert_array_equal(
-        surface.sample([-100, -3, 0, 3, 100], [-100, 5.25, 100]),
-        [[0, 0, 1.5, 3, 3], [5, 5, 6.5, 8, 8], [20, 20, 21.5, 25, 25]],
-    )
+    # Outside the heights are those of the nearest point of the edge.
+    outside = HeightMap(HEIGHTS, X, Y).sample([-100, -3, 0, 3, 100], [-100, 5.25, 100])
+    np.testing.assert_array_equal(outside, [[0, 0, 1.5, 3, 3], [5, 5, 6.5, 8, 8], [20, 20, 21.5, 25, 25]])
 
 
 def with_holes():
@@ -103,27 +95,20 @@ def with_holes():
     return heights
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("heights", "size", "message"),
     [
         (HEIGHTS, None, "has no positions of its heights: give the size of the map along x, in metres"),
         (HEIGHTS, 0, "size = 0 must be greater than 0"),
-        (HEIGHTS, np.nan, "size = nan must be finite"),
-        (HEIGHTS[0], 1, "has heights of shape (4,), but must have at least 2 rows and 2 columns"),
-        (HEIGHTS[:1], 1, "has heights of shape (1, 4), but must have at least 2 rows and 2 columns"),
-        (HEIGHTS[:, :1], 1, "has heights of shape (3, 1), but must have at least 2 rows and 2 columns"),
-        (HEIGHTS[None], 1, "has heights of shape (1, 3, 4), but must have at least 2 rows and 2 columns"),
+        *((bad, 1, "has heights of shape") for bad in (HEIGHTS[0], HEIGHTS[:1], HEIGHTS[:, :1], HEIGHTS[None])),
         (HEIGHTS + 0j, 1, "has heights of type complex128, but they must be real numbers"),
         (HEIGHTS.astype(str), 1, "has heights of type <U32, but they must be real numbers"),
         (with_holes(), 1, "has holes, 2 of 12 heights, the first in row 1 and column 3 counted from 0"),
     ],
 )
 def test_invalid_maps_are_rejected(tmp_path, heights, size, message):
-    path = write_npy(tmp_path / "map.npy", heights)
-    with pytest.raises(UserError) as error:
-        read_height_map(path, size)
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
+    with pytest.raises(UserError, match=f"^[^\\n]*{message}[^\\n]*$"):
+        read_height_map(write_npy(tmp_path / "map.npy", heights), size)
 
 
 @each_row(
@@ -134,7 +119,6 @@ def test_invalid_maps_are_rejected(tmp_path, heights, size, message):
         ({"x": X, "y": np.stack([Y] * 4)}, "has y of shape (4, 3), but its heights need (3,)"),
         ({"x": X, "y": Y[::-1]}, "has y[0] = 6 and y[1] = 5.5: positions must increase"),
         ({"x": [0, np.nan, 2, 3], "y": Y}, "has x[1] = nan: positions must be finite"),
-        ({"x": [0, 1, 2, np.inf], "y": Y}, "has x[3] = inf: positions must be finite"),
         ({"x": [0, 1, 2, 3.01], "y": Y}, "has x[2] and x[3] 1.01 apart, but 1.00333 on average: positions must"),
         ({"x": ["a", "b", "c", "d"], "y": Y}, "has x of type <U1, but they must be real numbers"),
     ],
@@ -174,18 +158,14 @@ def test_missing_and_damaged_files_are_rejected(tmp_path, suffix, capfd):
     }
     writers[suffix]()
     content = path.read_bytes()
-    for damaged in (content[: len(content) // 2], content[:-20], b"", b"neither of these\n" * 20):
+    np.save(tmp_path / "objects.npy", np.array([[1, 2], [3, None]], dtype=object))
+    pickled = (tmp_path / "objects.npy").read_bytes()
+    for damaged in (content[: len(content) // 2], content[:-20], b"", b"neither of these\n" * 20, pickled):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match=f"map{suffix} is damaged, or is not"):
             read_height_map(path, 6.0)
     # There is no output besides the exception.
     assert capfd.readouterr() == ("", "")
-
-
-def test_pickled_objects_are_never_loaded(tmp_path):
-    path = write_npy(tmp_path / "map.npy", np.array([[1, 2], [3, None]], dtype=object))
-    with pytest.raises(ValueError, match=r"map.npy is damaged, or is not one array of numbers"):
-        read_height_map(path, 6.0)
 
 
 HEADER = {"ncols": 4, "nrows": 3, "xllcorner": 499997, "yllcorner": 6000004.5, "cellsize": 2, "NODATA_value": -9999}
@@ -268,23 +248,15 @@ def test_invalid_ascii_grids_are_rejected(tmp_path, changes, message):
     ("options", "message"),
     [
         ({"size": 6.0}, r"size = 6.0 must not be given: .*map.asc has positions of its own"),
-        (
-            {"origin": (6000007.5, 500001)},
-            r"origin_x = 6000007.5 must lie within 10 km of .*map.asc, whose x is 499998 to",
-        ),
+        ({"origin": (6000007.5, 500001)}, r"origin_x = 6000007.5 must lie within 10 km of .*map.asc, whose x is"),
         ({"origin": (5e5, 6010009.75)}, r"origin_y = 6010009.75 must lie within 10 km of .* is 6000005.5 to 6000009.5"),
-        ({"origin": (np.nan, 0)}, "origin_x = nan must be finite"),
     ],
 )
 def test_invalid_placements_are_rejected(tmp_path, options, message):
     with pytest.raises(UserError, match=message):
         read_height_map(write_ascii_grid(tmp_path / "map.asc"), **options)
-
-
-def test_origin_needs_positions(tmp_path):
-    path = write_npy(tmp_path / "map.npy", HEIGHTS)
     with pytest.raises(UserError, match=r"origin_x and origin_y must not be given: .*map.npy has no positions"):
-        read_height_map(path, 6.0, (0.0, 0.0))
+        read_height_map(write_npy(tmp_path / "map.npy", HEIGHTS), 6.0, (0.0, 0.0))
 
 
 def write_geotiff(path, heights=HEIGHTS[::-1], count=1, transform=(2, 0, 499997, 0, -2, 6000010.5), crs=32633, **tags):

@@ -33,9 +33,8 @@ def test_facets_have_the_slope_variance_of_the_waves_that_they_hold(wind, shorte
     expected = np.array(variance_of_long_waves(wind, shortest))
     lost = []
     for cells_per_wave in (12, 24):
-        sea = read(
-            wind_speed=wind, period=512.0, cell_size=shortest / cells_per_wave, shortest_wave=shortest, refined_size=9.0
-        )
+        cells = {"cell_size": shortest / cells_per_wave, "shortest_wave": shortest, "refined_size": 9.0}
+        sea = read(wind_speed=wind, period=512.0, **cells)
         np.testing.assert_allclose(np.add(sea.resolved_variance, sea.ripple_variance), cox_munk(wind), rtol=1e-9)
         lost.append(1 - np.array(sea.resolved_variance) / expected)
     # The sum over waves of whole numbers per period equals the integral to 0.4 %.
@@ -43,11 +42,11 @@ def test_facets_have_the_slope_variance_of_the_waves_that_they_hold(wind, shorte
     assert np.all((lost[0] > lost[1]) & (lost[0] - lost[1] < (2 * np.pi / 12) ** 2 / 12 / 2))
 
 
-@pytest.mark.parametrize("wind", [1e-300, 1e-150, 1e-30, 0])
-def test_a_breath_of_wind_makes_no_waves(wind):
+def test_a_breath_of_wind_makes_no_waves():
     """The wavenumber of its peak overflows."""
-    sea = read(spectrum="elfouhaily", wind_speed=wind)
-    assert np.all(sea.heights(np.arange(5.0), np.arange(4.0)) == 0)
+    for wind in (1e-300, 1e-150, 1e-30, 0):
+        sea = read(spectrum="elfouhaily", wind_speed=wind)
+        assert np.all(sea.heights(np.arange(5.0), np.arange(4.0)) == 0)
 
 
 def test_finer_cells_show_the_same_waves():

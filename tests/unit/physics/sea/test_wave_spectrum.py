@@ -247,14 +247,10 @@ def test_directional_spectrum_integrates_to_elevation_and_slopes(kind):
     middle = np.array([0.3, 0.5, 1.0])[:, None]
     rings = 2 * np.pi * middle * directional(spectrum, middle * np.cos(phi), middle * np.sin(phi))
     np.testing.assert_allclose(spectrum.omnidirectional(middle[:, 0]), rings.mean(axis=1), rtol=2e-3, atol=1e-12)
-
-
-@each_row("kind", SPECTRA)
-def test_opposite_waves_have_equal_density(kind):
+    # Opposite waves have equal density.
     kx, ky = np.random.default_rng(1).uniform(-1, 1, (2, 200))
-    spectrum = SPECTRA[kind]
-    there, back = directional(spectrum, kx, ky), directional(spectrum, -kx, -ky)
-    np.testing.assert_allclose(there, back, rtol=1e-12)
+    there = directional(spectrum, kx, ky)
+    np.testing.assert_allclose(there, directional(spectrum, -kx, -ky), rtol=1e-12)
     assert there.any()
 
 

@@ -19,18 +19,8 @@ from mitransient_lidar.physics.water.water_types import (
     water_of,
 )
 
-JERLOV_KD = {
-    "I": 0.0486,
-    "IA": 0.0533,
-    "IB": 0.0590,
-    "II": 0.0796,
-    "III": 0.1171,
-    "1C": 0.1272,
-    "3C": 0.1972,
-    "5C": 0.3072,
-    "7C": 0.4816,
-    "9C": 0.738,
-}
+JERLOV_KD = {"I": 0.0486, "IA": 0.0533, "IB": 0.0590, "II": 0.0796, "III": 0.1171}
+JERLOV_KD |= {"1C": 0.1272, "3C": 0.1972, "5C": 0.3072, "7C": 0.4816, "9C": 0.738}
 
 
 def test_derived_properties():
@@ -45,16 +35,11 @@ def test_derived_properties():
     assert mixed.particle_backscatter_ratio == pytest.approx(0.02)
 
 
-def test_nothing_in_the_water():
-    water = InherentProperties(0, 0, 0)
-    assert (water.albedo, water.backscatter_ratio, water.kd) == (0, 0, 0)
-
-
-def test_pure_seawater_at_532():
-    water = pure_seawater()
-    assert water.absorption == pytest.approx(0.04444, abs=1e-6)
-    assert water.scattering == pytest.approx(0.001962, abs=1e-6)
+def test_pure_seawater_at_532_and_nothing_in_the_water():
+    water, empty = pure_seawater(), InherentProperties(0, 0, 0)
+    assert (water.absorption, water.scattering) == pytest.approx((0.04444, 0.001962), abs=1e-6)
     assert water.backscatter_ratio == 0.5
+    assert (empty.albedo, empty.backscatter_ratio, empty.kd) == (0, 0, 0)
 
 
 @each_row(
@@ -78,14 +63,12 @@ def test_particles_of_no_molecules_stay_without():
 
 
 @each_row(("water_type", "kd"), JERLOV_KD.items())
-def test_jerlov_types_have_jerlovs_kd(water_type, kd):
-    assert jerlov(water_type).kd == pytest.approx(kd, rel=1e-9)
-
-
-@each_row("water_type", JERLOV_KD)
-def test_jerlov_types_agree_with_lees_formula(water_type):
+def test_jerlov_types_have_jerlovs_kd_and_agree_with_lees_formula(water_type, kd):
     """Lee, Du and Arnone (2005), which is linear in bb: too much where that is more than a tenth of a."""
-    water = jerlov(water_type)
+    water, inverse = jerlov(water_type), from_kd(kd)
+    assert water.kd == pytest.approx(kd, rel=1e-9)
+    for name in ("absorption", "scattering", "backscattering"):
+        assert getattr(inverse, name) == pytest.approx(getattr(water, name), rel=1e-9)
     lee = water.absorption + 4.18 * (1 - 0.52 * np.exp(-10.8 * water.absorption)) * water.backscattering
     assert lee == pytest.approx(water.kd, rel=0.025 if water.kd < 0.3 else 0.07)
 
@@ -116,29 +99,15 @@ def test_chlorophyll_at_a_node_of_the_table():
     assert chlorophyll(2, 550).kd == pytest.approx(expected, rel=1e-9)
 
 
-def test_particle_scattering_at_550():
-    water, sea = chlorophyll(0.1, 550), pure_seawater(550)
+def test_particle_scattering():
+    """At 550 nm, and in the blue: v = (lg 0.1 - 0.3)/2 = -0.65 below 2 mg/m^3, 0 from there on."""
     particles = 0.416 * 0.1**0.766
-    assert water.scattering - sea.scattering == pytest.approx(particles, rel=1e-12)
-    assert water.backscattering - sea.backscattering == pytest.approx((0.002 + 0.01 * 0.75) * particles, rel=1e-12)
-
-
-def test_particle_scattering_in_the_blue():
-    # v = (lg 0.1 - 0.3)/2 = -0.65 below 2 mg/m^3, 0 from there on
-    clear, sea = chlorophyll(0.1, 440), pure_seawater(440)
-    particles = 0.416 * 0.1**0.766
-    assert clear.scattering - sea.scattering == pytest.approx(particles * 0.8**-0.65, rel=1e-12)
-    expected = (0.002 + 0.0075 * 0.8**-0.65) * particles
-    assert clear.backscattering - sea.backscattering == pytest.approx(expected, rel=1e-12)
-    assert chlorophyll(5, 440).scattering - sea.scattering == pytest.approx(0.416 * 5**0.766, rel=1e-12)
-
-
-@each_row("water_type", JERLOV_KD)
-def test_kd_of_a_jerlov_type_gives_that_type(water_type):
-    water, expected = from_kd(JERLOV_KD[water_type]), jerlov(water_type)
-    assert water.absorption == pytest.approx(expected.absorption, rel=1e-9)
-    assert water.scattering == pytest.approx(expected.scattering, rel=1e-9)
-    assert water.backscattering == pytest.approx(expected.backscattering, rel=1e-9)
+    for wavelength, factor in ((550, 1.0), (440, 0.8**-0.65)):
+        water, sea = chlorophyll(0.1, wavelength), pure_seawater(wavelength)
+        assert water.scattering - sea.scattering == pytest.approx(particles * factor, rel=1e-12)
+        expected = (0.002 + 0.0075 * factor) * particles
+        assert water.backscattering - sea.backscattering == pytest.approx(expected, rel=1e-12)
+    assert chlorophyll(5, 440).scattering - pure_seawater(440).scattering == pytest.approx(0.416 * 5**0.766, rel=1e-12)
 
 
 @each_row("kd", [0.0486, 0.05, 0.1, 0.6])
