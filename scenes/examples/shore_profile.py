@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitransient_lidar.flights.products import read_points
-from mitransient_lidar.plots.point_clouds import CLASS_COLOURS
+from mitransient_lidar.plots.palette import CLASSES
 from mitransient_lidar.results.attributes import PointClass
 
 #: Marker of each class, so that colour is not all that tells them apart.
@@ -38,7 +38,7 @@ def main() -> None:
     figure = Figure(figsize=(8, 6), layout="constrained")
     profile, errors = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
     profile.plot(x[solid], truth[solid], color="black", linewidth=1, label="true height")
-    for one, colour in CLASS_COLOURS.items():
+    for one, colour in CLASSES.items():
         chosen = kind == one
         if not np.any(chosen):
             continue

@@ -1,6 +1,8 @@
 """Commands of README, start page and guides: their options exist, and files that they read are shipped or written."""
 
+import ast
 import functools
+import importlib
 import re
 import shlex
 from pathlib import Path
@@ -79,6 +81,14 @@ def test_the_guides_list_the_example_files() -> None:
     section = (ROOT / "docs" / "guide" / "index.md").read_text("utf-8").partition("## Files of the guides")[2]
     names = set(re.findall(r"`([\w]+\.\w+)`", section))
     assert names == set(catalogue.example_files())
+
+
+def test_names_that_example_scripts_import_exist() -> None:
+    for script in (path for name, path in catalogue.example_files().items() if name.endswith(".py")):
+        for node in ast.walk(ast.parse(script.read_text("utf-8"))):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("mitransient_lidar"):
+                module = importlib.import_module(str(node.module))
+                assert [one.name for one in node.names if not hasattr(module, one.name)] == [], script.name
 
 
 def test_example_files_are_those_of_the_text() -> None:
