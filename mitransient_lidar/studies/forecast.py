@@ -50,18 +50,8 @@ from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.files import Given
+from mitransient_lidar.studies import depth_bias
 from mitransient_lidar.studies.cases import Cases
-from mitransient_lidar.studies.depth_bias import (
-    HeightError,
-    InstrumentName,
-    OwnReceiver,
-    Places,
-    Pointing,
-    PositionError,
-    Records,
-    SeaScene,
-    SeaSeed,
-)
 
 #: Largest ratio of neighbouring depths in tables, and where the share of found bottoms falls; that of waters.
 _COARSE, _FINE, _WATERS = 1.25, 1.07, 1.4
@@ -137,7 +127,7 @@ class _Site:
 @checked
 @alone
 def forecast(
-    instrument: InstrumentName,
+    instrument: depth_bias.InstrumentName,
     site: Annotated[
         str | os.PathLike[str],
         Option(
@@ -151,17 +141,17 @@ def forecast(
     ] = None,
     kd: Annotated[Any, Option("Diffuse attenuation, or a GeoTIFF of it", unit="1/m", form="NUMBER|FILE")] = None,
     values: Annotated[str | None, Option("Whether the map has heights or depths, by default as it states")] = None,
-    scene: SeaScene = "table1",
-    receiver: OwnReceiver = None,
+    scene: depth_bias.SeaScene = "table1",
+    receiver: depth_bias.OwnReceiver = None,
     corrections: Annotated[
         Given | None, Option("Table from depth-bias that corrects the depths, auto for the shipped one", form="FILE")
     ] = None,
-    shots: Places = 24,
-    records: Records = 2,
-    pointing_mrad: Pointing = 0.1,
-    position_m: PositionError = 0.05,
-    height_m: HeightError = 0.05,
-    seed: SeaSeed = 1,
+    shots: depth_bias.Places = 24,
+    records: depth_bias.Records = 2,
+    pointing_mrad: depth_bias.Pointing = 0.1,
+    position_m: depth_bias.PositionError = 0.05,
+    height_m: depth_bias.HeightError = 0.05,
+    seed: depth_bias.SeaSeed = 1,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Forecast where an instrument finds the bottom of a site, how well, and down to which depth.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -76,6 +77,17 @@ class HeightMap:
         (i, right), (j, up) = _cells(self.x, x), _cells(self.y, y)
         columns = self.heights[:, i] * (1 - right) + self.heights[:, i + 1] * right
         return np.asarray(columns[j] * (1 - up[:, None]) + columns[j + 1] * up[:, None])
+
+    def facet_variance(self, wind_direction: float) -> tuple[float, float]:
+        """Return the mean-square slopes of facets along and across the wind, whose direction is in radians."""
+        right = np.diff(self.heights, axis=1) / (self.x[1] - self.x[0])
+        up = np.diff(self.heights, axis=0) / (self.y[1] - self.y[0])
+        cos, sin = math.cos(wind_direction), math.sin(wind_direction)
+        # The two triangles of a cell, split from its lower right to its upper left corner.
+        pairs = ((right[:-1], up[:, :-1]), (right[1:], up[:, 1:]))
+        along = float(np.mean([np.mean((cos * x + sin * y) ** 2) for x, y in pairs]))
+        across = float(np.mean([np.mean((cos * y - sin * x) ** 2) for x, y in pairs]))
+        return along, across
 
 
 def read_height_map(

@@ -185,7 +185,7 @@ class SeaSurface:
             is_free = [read(name) == AUTO for name in ("centre_x", "centre_y")]
             centre = (middle[0] if is_free[0] else centre[0], middle[1] if is_free[1] else centre[1])
             _check_number_of_cells(refined_size, cell)
-            resolved = _facet_variance(terrain, wind_direction)
+            resolved = terrain.facet_variance(wind_direction)
         elif wake is None and not any(slope):
             cell = math.inf
         else:
@@ -489,18 +489,6 @@ def _check_number_of_cells(refined_size: float, cell: float) -> None:
             f"refined_size = {refined_size:g} with cell_size = {cell:g} needs {refined_size / cell:.0f} cells per "
             f"side but at most {_MOST_CELLS} are allowed"
         )
-
-
-def _facet_variance(terrain: HeightMap, wind_direction: float) -> tuple[float, float]:
-    """Return the mean-square slopes of a height map's facets along and across the wind."""
-    right = np.diff(terrain.heights, axis=1) / (terrain.x[1] - terrain.x[0])
-    up = np.diff(terrain.heights, axis=0) / (terrain.y[1] - terrain.y[0])
-    cos, sin = math.cos(wind_direction), math.sin(wind_direction)
-    # The two triangles of a cell, split from its lower right to its upper left corner.
-    pairs = ((right[:-1], up[:, :-1]), (right[1:], up[:, 1:]))
-    along = float(np.mean([np.mean((cos * x + sin * y) ** 2) for x, y in pairs]))
-    across = float(np.mean([np.mean((cos * y - sin * x) ** 2) for x, y in pairs]))
-    return along, across
 
 
 def _read_wake(read: Read) -> Wake | None:
