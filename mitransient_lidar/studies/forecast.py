@@ -50,8 +50,18 @@ from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.files import Given
-from mitransient_lidar.studies import depth_bias
 from mitransient_lidar.studies.cases import Cases
+from mitransient_lidar.studies.depth_bias import (
+    HeightError,
+    InstrumentName,
+    OwnReceiver,
+    Places,
+    Pointing,
+    PositionError,
+    Records,
+    SeaScene,
+    SeaSeed,
+)
 
 #: Largest ratio of neighbouring depths in tables, and where the share of found bottoms falls; that of waters.
 _COARSE, _FINE, _WATERS = 1.25, 1.07, 1.4
@@ -127,7 +137,7 @@ class _Site:
 @checked
 @alone
 def forecast(
-    instrument: depth_bias.InstrumentName,
+    instrument: InstrumentName,
     site: Annotated[
         str | os.PathLike[str],
         Option(
@@ -141,17 +151,17 @@ def forecast(
     ] = None,
     kd: Annotated[Any, Option("Diffuse attenuation, or a GeoTIFF of it", unit="1/m", form="NUMBER|FILE")] = None,
     values: Annotated[str | None, Option("Whether the map has heights or depths, by default as it states")] = None,
-    scene: depth_bias.SeaScene = "table1",
-    receiver: depth_bias.OwnReceiver = None,
+    scene: SeaScene = "table1",
+    receiver: OwnReceiver = None,
     corrections: Annotated[
         Given | None, Option("Table from depth-bias that corrects the depths, auto for the shipped one", form="FILE")
     ] = None,
-    shots: depth_bias.Places = 24,
-    records: depth_bias.Records = 2,
-    pointing_mrad: depth_bias.Pointing = 0.1,
-    position_m: depth_bias.PositionError = 0.05,
-    height_m: depth_bias.HeightError = 0.05,
-    seed: depth_bias.SeaSeed = 1,
+    shots: Places = 24,
+    records: Records = 2,
+    pointing_mrad: Pointing = 0.1,
+    position_m: PositionError = 0.05,
+    height_m: HeightError = 0.05,
+    seed: SeaSeed = 1,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Forecast where an instrument finds the bottom of a site, how well, and down to which depth.
@@ -204,8 +214,7 @@ def forecast(
     if secchi is not None and kd is not None:
         raise UserError(f"secchi = {secchi} and kd = {kd} are alternatives: give one of them")
     given, name = (kd, "kd") if secchi is None else (secchi, "secchi")
-    place = _Site.of(site, values)
-    deep = place.depth >= _SHALLOWEST
+    deep = (place := _Site.of(site, values)).depth >= _SHALLOWEST
     if not deep.any():
         highest = float(np.nanmax(place.depth, initial=-np.inf))
         raise UserError(
@@ -244,10 +253,9 @@ def forecast(
         attributes["map_origin"] = place.terrain.origin
         attributes["map_system"] = getattr(place.terrain.system, "wkt", None) or ""
     result = label(xr.Dataset(maps, {**place.coords, "water": waters}, attributes), "forecast")
-    flags = [_LAND, -1, *range(len(SURVEY_ORDERS) + 1)]
+    flags = np.array([_LAND, -1, *range(len(SURVEY_ORDERS) + 1)], float)
     meanings = " ".join(["land", "lost", *(one.name for one in SURVEY_ORDERS), "none"])
-    result["order"].attrs |= {"flag_values": np.array(flags, float), "flag_meanings": meanings}
-    return result
+    return result.assign(order=result["order"].assign_attrs(flag_values=flags, flag_meanings=meanings))
 
 
 def write_maps(found: xr.Dataset, path: str | os.PathLike[str]) -> None:
@@ -280,9 +288,8 @@ def describe_forecast(found: xr.Dataset) -> list[str]:
 def _sentence(found: xr.Dataset) -> str:
     """Return what a forecast says in one sentence."""
     order, chance, depth = (found[name].values for name in ("order", "found", "depth"))
-    wet = np.isfinite(chance)
     what = "site" if "y" in found.dims else "range of depths"
-    seen = wet & (chance >= LEAST_FOUND)
+    seen = (wet := np.isfinite(chance)) & (chance >= LEAST_FOUND)
     if not seen.any():
         return f"the bottom is found nowhere in the {what}"
     lost = found["deepest"].values[wet & np.isfinite(found["deepest"].values)]
@@ -324,10 +331,8 @@ class _Bottoms:
         self._records, self._seed = records, seed
         self._places = np.random.default_rng(seed).uniform(-_FARTHEST, _FARTHEST, (shots, 2))
         session = open_scene(scene, params, instrument)
-        lidar = find_lidar_scene(session.scene, session.sensor)
-        self._reach = reach_of_scattering(lidar)
-        receiver_of = xr.Dataset(attrs={"instrument": instrument})
-        self._receiver: ReceiverChannels = receiver_of_result(receiver_of, receiver)
+        self._reach = reach_of_scattering(find_lidar_scene(session.scene, session.sensor))
+        self._receiver: ReceiverChannels = receiver_of_result(xr.Dataset(attrs={"instrument": instrument}), receiver)
         self._sea: dict[float, Any] = {}
         self._attributes: dict[str, Any] = {}
         self._pixels: list[str] = []
@@ -416,9 +421,8 @@ class _Bottoms:
 
     def _labelled(self, cells: Mapping[float, Mapping[str, Any]]) -> xr.Dataset:
         """Return a table as of `depth_bias.depth_bias`."""
-        first = next(iter(cells.values()))
         data: dict[str, Any] = {}
-        for name, value in first.items():
+        for name, value in next(iter(cells.values())).items():
             dims = (*AXES, "estimator", "pixel") if np.ndim(value) else AXES
             data[name] = dims, np.array([cell[name] for cell in cells.values()])[np.newaxis, np.newaxis, np.newaxis]
         wind = float(self._attributes.get("scene.wind_speed") or 0)
@@ -438,9 +442,8 @@ def _measured(recorded: xr.Dataset, corrections: xr.Dataset | None) -> dict[str,
     bottom = echoes.sel(echo="bottom").transpose("shot", "pixel", "estimator")
     right = np.abs(bottom["depth_m"].values - truth[:, np.newaxis, np.newaxis]) < _RIGHT
     numbers["found"] = np.mean(right & has_echo(bottom["flags"].values), axis=0).T
-    for name in ("slope_along", "slope_across"):
-        numbers[name] = float(np.sqrt(np.mean(recorded[f"true_{name}"].values ** 2)))
-    return numbers
+    slopes = {name: recorded[f"true_{name}"].values for name in ("slope_along", "slope_across")}
+    return numbers | {name: float(np.sqrt(np.mean(values**2))) for name, values in slopes.items()}
 
 
 def _found(cell: Mapping[str, Any]) -> float:
@@ -490,8 +493,8 @@ def _maps(
         totals["deepest"][used] += (share * _deepest(nodes, found) / ratio)[used]
     for key, values in totals.items():
         maps[key][deep] = values
-    lost = ~(maps["found"] >= LEAST_FOUND)
-    maps["tvu"][lost] = maps["thu"][lost] = np.nan
+    for key in ("tvu", "thu"):
+        maps[key][~(maps["found"] >= LEAST_FOUND)] = np.nan
     order = order_met(depth, maps["tvu"], maps["thu"])
     maps["order"] = np.where(deep, order, np.where(depth <= 0, _LAND, np.nan))
     return maps
