@@ -236,6 +236,8 @@ def test_parameters_without_influence_and_degenerate_pairs():
         (lambda data: data.drop_vars("waveform_derivative"), {}, "has no waveform_derivative"),
         (lambda data: data.assign(waveform_derivative=np.nan * data["waveform_derivative"]), {}, "not finite"),
         (lambda data: [data, data.assign_coords(time=data["time"] + 1)], {}, "the renders differ in time"),
+        (lambda data: [], {}, "must hold at least one result"),
+        (lambda data: data, {"nuisances": {"phase": 1.0}}, "nuisance = 'phase' must be one of time_offset, scale"),
         (lambda data: data, {"nuisances": {"scale": 0.0}}, "scale = 0.0 must be a standard deviation above 0"),
         (lambda data: data.assign(waveform_derivative=0 * data["waveform_derivative"]), {}, "no information"),
     ],

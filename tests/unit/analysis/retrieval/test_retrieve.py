@@ -290,6 +290,7 @@ def drop(name):
     [
         (lambda: retrieve.surface_slopes(on_axis().isel(pixel=[0])), "waveforms of at least 2 pixels"),
         (lambda: retrieve.surface_slopes(drop("altitude")), "the dataset has no attribute altitude"),
+        (lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=0.1), r"wind_speed = 0\.1 must lie between 1 and 30"),
         (lambda: retrieve.surface_slopes(result(), wind_speed=6), "wind_speed = 6 needs a result of a round Gaussian"),
         (
             lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=6, slope_deviation=(0.1, 0.1)),
