@@ -18,7 +18,13 @@ from mitransient_lidar.analysis.waveforms.echo_detection import DetectedEchoes, 
 from mitransient_lidar.analysis.waveforms.first_echoes import SEPARATE
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.analysis.waveforms.saturation import longest_run, may_be_second_return, saturated_spans, widen
-from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE, SurfaceLevel, infrared_level, surface_times
+from mitransient_lidar.analysis.waveforms.surface_times import (
+    GRAZING,
+    LEAST_SHARE,
+    SurfaceLevel,
+    infrared_level,
+    surface_times,
+)
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray, integer
@@ -104,7 +110,9 @@ def extract(
     level : SurfaceLevel, optional
         Arrival of the surface in each waveform as known without it, NaN where it is not, for land and very shallow
         water, and for depths as far as it is known better than by the waveform. By default that of the infrared channel
-        (`surface_times.infrared_level`), or else the mean sea level, with an error of 0.15 m and the waves.
+        (`surface_times.infrared_level`), or else the mean sea level, with an error of 0.15 m and the waves. Where a
+        first echo is uncertain, and eight or more waveforms have a column below a certain surface, the median of these
+        surfaces replaces it (`surface_times.SurfaceLevel.of_neighbours`).
     iterations : int
         Iterations of the deconvolution, 1 to 10 000.
     block : int
@@ -212,11 +220,17 @@ def extract(
         level = infrared_level(extract(infrared), infrared, dataset, waveforms.lines, waveforms.count)
     wanted = None if targets is None else integer("targets", targets, 1, 100)
     settings = _Settings(names, threshold, contrast, layers, depth_from, level, iterations, wanted)
-    starts = range(0, waveforms.count, block)
-    parts = [_measure(waveforms, slice(start, min(start + block, waveforms.count)), settings) for start in starts]
-    count = wanted or max(part["flags"].shape[-1] for part in parts) - len(ECHOES) + 1
-    parts = [_with_targets(part, count) for part in parts]
-    table = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    table = _measured(waveforms, block, settings)
+    unsure = table["class_probability"] < 1
+    better = _level_of_neighbours(waveforms, table, settings) if settings.level is None and unsure.any() else None
+    if better is not None:
+        again = _measured(waveforms, block, replace(settings, level=better))
+        count = max(one["flags"].shape[-1] for one in (table, again)) - len(ECHOES) + 1
+        first, second = (_with_targets(one, count) for one in (table, again))
+        table = {
+            name: np.where(unsure.reshape(-1, *[1] * (values.ndim - 1)), second[name], values)
+            for name, values in first.items()
+        }
     table = _with_depths(dataset, waveforms, table, settings)
     return _label(dataset, waveforms, table, settings, several)
 
@@ -246,6 +260,34 @@ def _with_targets(part: dict[str, npt.NDArray[Any]], targets: int) -> dict[str, 
         value = {"flags": int(EchoFlag.NO_ECHO), "class": int(EchoClass.NONE)}.get(name, np.nan)
         filled[name] = np.insert(part[name], [part[name].shape[-1] - 1] * missing, value, axis=-1)
     return filled
+
+
+def _measured(waveforms: Waveforms, block: int, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
+    """Return the quantities of all waveforms, of which a block is in memory at a time."""
+    starts = range(0, waveforms.count, block)
+    parts = [_measure(waveforms, slice(start, min(start + block, waveforms.count)), settings) for start in starts]
+    count = settings.targets or max(part["flags"].shape[-1] for part in parts) - len(ECHOES) + 1
+    parts = [_with_targets(part, count) for part in parts]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _level_of_neighbours(
+    waveforms: Waveforms, table: dict[str, npt.NDArray[Any]], settings: _Settings
+) -> SurfaceLevel | None:
+    """Return the surface's arrival by surfaces whose class is certain; None without them."""
+    if "gaussian" not in settings.estimators:
+        return None
+    rows, number = slice(0, waveforms.count), settings.estimators.index("gaussian")
+    lines = waveforms.lines_of(rows)
+    column, error = (table[name][:, number, ECHOES.index("column")] for name in ("amplitude", "amplitude_stderr"))
+    certain = (table["class"][:, 0] == EchoClass.SURFACE) & (table["class_probability"] == 1)
+    certain &= (column > _SIGNIFICANT * error) & (lines.off_nadir < GRAZING)
+    certain &= ~(lines.beam_share < LEAST_SHARE * waveforms.brightest)
+    time, error = (table[name][:, number, 0] for name in ("time_ns", "time_ns_stderr"))
+    certain &= np.isfinite(time) & np.isfinite(error)
+    if not certain.any():
+        return None
+    return waveforms.surface_level(rows).of_neighbours(time, error, certain, 1 / (IN_AIR * np.cos(lines.off_nadir)))
 
 
 def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str, npt.NDArray[Any]]:

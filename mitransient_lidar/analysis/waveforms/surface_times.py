@@ -22,6 +22,9 @@ GRAZING = np.radians(60.0)
 _LIMIT = 4.0  # standard deviations by which an echo may deviate from the other pixels' surface
 #: Error of the mean sea level [m].
 LEVEL = 0.15
+# Fewest surfaces that state the level of all, their standard deviation over the median of absolute deviations, and the
+# error of columns' onsets [m].
+_NEIGHBOURS, _PER_MAD, _ONSET = 8, 1.4826, 0.03
 _SHAPE = 0.1  # error of an echo's time by its unknown shape, in echo widths
 _LEAST_ERROR = 1e-3  # of a time [ns]
 
@@ -40,6 +43,25 @@ class SurfaceLevel(NamedTuple):
         """Return these arrivals, and others where they are not known (NaN)."""
         known = np.isfinite(self.time_ns)
         return SurfaceLevel(*(np.where(known, own, one) for own, one in zip(self, other, strict=True)))
+
+    def of_neighbours(
+        self, time_ns: FloatArray, error_ns: FloatArray, known: BoolArray, per_metre: FloatArray
+    ) -> SurfaceLevel:
+        """Return arrivals by the mean level of the surfaces that are known, if they are several; else these.
+
+        The arguments have the shape (n,): measured arrivals of surfaces, their errors [ns], which of them count, and
+        time per height [ns/m]. The level is the median height, and its error the robust spread of heights, waves
+        included, and that of the onset of columns.
+        """
+        known = known & (2 * error_ns < self.stderr_ns)
+        count = np.count_nonzero(known)
+        height = (self.time_ns - time_ns)[known] / per_metre[known]
+        level = float(np.median(height)) if count >= _NEIGHBOURS else np.inf
+        if abs(level) > _LIMIT * LEVEL:
+            return self
+        spread = _PER_MAD * float(np.median(np.abs(height - level))) * np.sqrt(1 + 1 / count)
+        error = per_metre * np.hypot(spread, _ONSET)
+        return SurfaceLevel(self.time_ns - per_metre * level, np.minimum(error, self.stderr_ns))
 
     def combined(
         self, time_ns: FloatArray, noise_ns: FloatArray, method_ns: FloatArray

@@ -152,3 +152,26 @@ def test_a_pulse_that_meets_the_edge_of_a_pier_keeps_the_number_of_targets():
     assert table["class"].sel(echo="target").values.tolist() == [EchoClass.ABOVE, EchoClass.NONE]
     np.testing.assert_allclose(table["depth_m"].sel(echo="bottom"), 3.0, atol=0.05)
     assert float(table["depth_m"].sel(echo="target")[0]) == pytest.approx(-2.0, abs=0.05)
+
+
+def test_neighbours_tell_the_level_over_very_shallow_water():
+    """0.3 m below the mean sea level, 0.1 m of water was 0.45 m with an error of 2 cm; columns of deep water tell."""
+    depths = np.array([0.1, 0.2, *np.linspace(2.0, 4.0, 12)])
+    (surface, bottom), depth, error = found(recorded([water(one, level=-0.3) for one in depths], 5))
+    assert (surface[:2] == EchoClass.NONE).all()
+    assert (bottom[:2] == EchoClass.MERGED).all()
+    assert (np.abs(depth - depths)[:2] < 3 * error[:2]).all()
+
+
+def test_a_level_of_few_or_uncertain_surfaces_stays_as_it_was():
+    known = np.arange(20) < 12
+    level = SurfaceLevel(np.full(20, 100.0), np.full(20, 1.2))
+    late = np.where(known, 100.6 + 0.05 * np.cos(np.arange(20)), 130.0)
+    error, per_metre = np.full(20, 0.1), np.full(20, 6.67)
+    better = level.of_neighbours(late, error, known, per_metre)
+    np.testing.assert_allclose(better.time_ns, 100.6, atol=0.03)
+    assert (better.stderr_ns < 0.3).all()
+    assert level.of_neighbours(late, error, known & (np.arange(20) < 7), per_metre) is level
+    assert level.of_neighbours(late, np.full(20, 0.7), known, per_metre) is level
+    # A median of false surfaces, 4 standard deviations below the mean sea level.
+    assert level.of_neighbours(late + 5, error, known, per_metre) is level
