@@ -384,8 +384,7 @@ def light_faintly(scene: LidarScene, target: mi.Shape, places: FloatArray, turns
     """
     low, high = box_of(target)
     rays = Rays.of_beam(scene, scene.transmitter)
-    across, along = rays.angles
-    pixel, seen = scene.receiver.pixels.pixel_at(across, along, mi.Float(0.5))
+    pixel, seen = scene.receiver.pixels.pixel_at(rays.angles.x, rays.angles.y, mi.Float(0.5))
     pixel, counted = np.array(pixel), np.array(seen) > 0
     pose, height = scene.transmitter.pose, 0.5 * (low[2] + high[2])
     lit = scene.level_sea.at_height(pose.origin, rays.directions, height) - pose.ground_point()[:2]
