@@ -205,7 +205,9 @@ def decide(
         records.part(open_rows), found.surface[open_rows], waveforms.tail_ns, until[open_rows, np.newaxis]
     )
     farthest = level.time_ns + waveforms.echo_shape.peak_ns + shallow + _FAR * level.stderr_ns
-    is_shallow = records.time_of(np.where(near, following, found.surface)) < farthest
+    # What follows a first echo far below the level is light that met it twice, however late.
+    by_following = near & ~((deviation() > _FAR) & _is_weak_behind(records, found.surface, following))
+    is_shallow = records.time_of(np.where(by_following, following, found.surface)) < farthest
     # A faint echo may be the rise of the column, and one at the record's end may have a column behind it.
     left = records.time_ns[-1] - records.time_of(found.surface)
     behind = np.minimum(following, last - 1)

@@ -318,10 +318,10 @@ def find_echoes(
     )
     # Without a surface echo, the others are behind its latest time.
     latest = np.searchsorted(records.time_ns, np.broadcast_to(np.asarray(latest_ns), surface.shape), side="right") - 1
-    late = surface > latest
-    origin, surface = np.where(late, latest, surface), np.where(late, -1, surface)
-
-    reach = max(round(_REACH * width / records.bin_ns), 1)
+    late, reach = surface > latest, max(round(_REACH * width / records.bin_ns), 1)
+    # The rise of a late first peak is no column before it.
+    origin = np.where(late, np.minimum(latest, surface - reach), surface)
+    surface = np.where(late, -1, surface)
     behind = bins > origin[:, np.newaxis]
     rises, by_column, column = _above_column(np.maximum(power, 0), reach)
     # Near the surface there is no column to extrapolate from: the excess is the rise after a dip.

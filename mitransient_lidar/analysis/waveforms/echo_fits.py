@@ -27,6 +27,9 @@ _RISE = 0.5  # level of the column that its rise crosses
 _BRIGHT = 10.0  # levels of the column beyond which a peak is that of the surface
 _WEAK = 0.3  # first guess of the height of a surface without such a peak, in levels of the column
 _FAR = (-np.inf, np.inf)
+_BEFORE_NEXT, _LEAST_BEHIND = 1.5, 0.5  # end of a surface's samples before the next echo, and behind its peak [widths]
+# Place of a surface's decay among its parameters, largest logarithm of its ratio to the given one, and its least error.
+_OF_RATE, _MOST_DECAYS, _LEAST_DECAY_ERROR = 4, 2.0, 0.01
 _BROAD = 2.0  # width over waves from which an echo is the column's, in echo widths
 _CLOSE = 0.5  # least distance from the earliest time of a surface that a fit may find, in echo widths
 _HEIGHTS = np.array([0.0, 0.05, 0.12, 0.25, 0.45])  # tested heights of a surface that is not distinct, over the peak
@@ -43,11 +46,14 @@ def gaussian_surface(
     level: tuple[FloatArray, FloatArray] | None = None,
     *,
     reflects: bool = True,
+    decay_error: npt.ArrayLike = 0.0,
+    following: IntArray | None = None,
 ) -> Echoes:
     """Fit a surface echo together with the water column that begins at it.
 
-    The model is A E(u) plus a column C F(u) exp(-k u) from u = 0 on, blurred by E, where u is the time since the
-    surface, E the shape of an ideal echo, blurred by a Gaussian of free width, and F the focusing of light by waves.
+    The model is A E(u) plus a column C F(u) exp(-k (u - p)) from u = 0 on, blurred by E. Here u is the time since the
+    surface, p that of an echo with the found peak, E the shape of an ideal echo, blurred by a Gaussian of free width,
+    and F the focusing of light by waves.
     It is fitted from two echo widths before the peak to two after it, and determines the surface even where the peak is
     that of the column. Amplitude, energy and width are those of A E. The focusing of a single shot differs from its
     mean: over waves, samples that are later than an echo width behind the rise to C / 2 have a relative error of 0.8,
@@ -67,32 +73,41 @@ def gaussian_surface(
     width : float
         Expected full width of the echo at half maximum [ns].
     decay : array_like, shape () or (n,)
-        Rate k of decay of the column [1/ns], at least 0.
+        Rate k of decay of the column [1/ns], above 0, as fitted behind the echo or typical.
     shape : EchoShape
         Shape of an ideal echo.
     column : ColumnOnset, optional
         Blurred form of F; by default that of F = 1.
     level : (ndarray, ndarray), shape (n,) each, optional
-        C from the column behind the echo, and its standard error; NaN where it is not known.
+        C from the column behind the echo, extrapolated to the peak, and its standard error; NaN where it is not known.
     reflects : bool
         Whether the surface may send light back; otherwise A is 0, and the time that of the onset of the column.
+    decay_error : array_like, shape () or (n,)
+        Standard error of the logarithm of k.
+    following : ndarray of int, shape (n,), optional
+        Bins of the next echoes, -1 without one. Samples less than 1.5 echo widths before them do not count, except
+        until half a width behind the peak.
     """
     begin = column or ColumnOnset()
     # The brightest depth may be the peak, later than the surface; that of a single shot may be twice as deep.
     early = begin.brightest_ns
     data = Windows.of(records, bins, width, decay, (-2 - 2 * early / width, 2), shape)
     data = replace(data, earliest=-1.2 * width - 2 * early)
+    if following is not None:
+        apart = np.where(following >= 0, (following - bins) * records.bin_ns, np.inf)
+        until = np.maximum(apart - _BEFORE_NEXT * width, _LEAST_BEHIND * width)
+        data = replace(data, usable=data.usable & (data.u - shape.peak_ns <= until[:, np.newaxis]))
     # A column over waves that begins at the earliest time that a fit may find began before it.
     limit = data.earliest + _CLOSE * width if early > 0 else -np.inf
-    if level is not None:
-        data = replace(data, known=(3, *level))
+    deviation = np.maximum(np.broadcast_to(np.asarray(decay_error, np.float64), bins.shape), _LEAST_DECAY_ERROR)
+    data = replace(data, known=((4, np.zeros(bins.shape), deviation), *([(3, *level)] if level is not None else [])))
     peak = data.peak()
     rise = np.full(peak.shape, np.nan)
     if early > 0:
         data, rise = data.about_rise(rise if level is None else level[0])
     sigma = np.full(peak.shape, shape.sigma_of(width))
-    start = np.stack([np.full(peak.shape, -0.3 * width), sigma, 0.5 * peak, 0.7 * peak], axis=1)
-    faint = start if early == 0 else np.stack([start[:, 0] - early, sigma, 0 * peak, 0.7 * peak], axis=1)
+    start = np.stack([np.full(peak.shape, -0.3 * width), sigma, 0.5 * peak, 0.7 * peak, 0 * peak], axis=1)
+    faint = start if early == 0 else np.stack([start[:, 0] - early, sigma, 0 * peak, 0.7 * peak, 0 * peak], axis=1)
 
     if level is not None:
         rises = np.isfinite(rise)
@@ -101,19 +116,21 @@ def gaussian_surface(
         start[rises, 2] = _WEAK * level[0][rises]
 
     def model(p: FloatArray, u: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
-        time, s, height, level = (p[:, i : i + 1] for i in range(4))
-        jacobian = np.zeros((4, len(p), u.size))
+        time, s, height, level, q = (p[:, i : i + 1] for i in range(5))
+        k = k * np.exp(q)
+        jacobian = np.zeros((5, len(p), u.size))
         for delay, share, weight in shape.terms:
             v = u - time - delay
             z = v / s
             gauss = share * np.exp(-0.5 * z**2)
             # A Gaussian times an exponential is a later Gaussian.
             value, first, second = begin.at(v - k * s**2, s)
-            fall = weight * np.exp(np.clip(0.5 * (k * s) ** 2 - k * v, -700, 700))
-            jacobian[0] += height * gauss * z / s + level * fall * (k * value - first)
+            fall = weight * np.exp(np.clip(0.5 * (k * s) ** 2 - k * (u - delay), -700, 700))
+            jacobian[0] += height * gauss * z / s - level * fall * first
             jacobian[1] += height * gauss * z**2 / s + level * fall * s * (k**2 * value - 2 * k * first + second)
             jacobian[2] += gauss
             jacobian[3] += fall * value
+            jacobian[4] += level * fall * k * ((k * s**2 - u + delay) * value - s**2 * first)
         return height * jacobian[2] + level * jacobian[3], jacobian.transpose(1, 0, 2)
 
     def fitted(start: FloatArray, rows: BoolArray, height: FloatArray | None = None) -> WindowFits:
@@ -214,7 +231,7 @@ class Windows:
     """Samples about the peaks: times from them (bins,), samples and noise (n, bins), and decay rates (n, 1).
 
     Times count from the arrival of an ideal echo whose peak is in the bin of the peak; `earliest` is the first one that
-    a fit may find. A parameter may be `known`, with its standard error, shape (n,); NaN where it is not.
+    a fit may find. Parameters may be `known`, with their standard errors, shape (n,); NaN where they are not.
     """
 
     u: FloatArray
@@ -225,7 +242,7 @@ class Windows:
     width: float
     shape: EchoShape
     earliest: float
-    known: tuple[int, FloatArray, FloatArray] | None = None
+    known: tuple[tuple[int, FloatArray, FloatArray], ...] = ()
 
     @classmethod
     def of(
@@ -269,6 +286,8 @@ class Windows:
         highest[:2] = 1.2 * self.width, self.shape.sigma_of(3 * self.width)
         unit = np.full((len(scale), size), self.width)
         unit[:, 2:] = scale[:, np.newaxis]
+        if any(index == _OF_RATE for index, _, _ in self.known):
+            unit[:, _OF_RATE], lowest[_OF_RATE], highest[_OF_RATE] = 1.0, -_MOST_DECAYS, _MOST_DECAYS
         return Limits(lowest, highest, unit)
 
     def peak(self) -> FloatArray:
@@ -420,24 +439,23 @@ def fit_windows(
 
 @dataclass(frozen=True)
 class _Prior:
-    """Known value of one parameter of the fits, and the inverse of its standard error, 0 where it is not known."""
+    """Known values (n, k) of k parameters of the fits, and the inverse of their standard errors, 0 where not known."""
 
-    index: int
+    index: list[int]
     mean: FloatArray
     weight: FloatArray
 
     @classmethod
-    def of(cls, known: tuple[int, FloatArray, FloatArray] | None, count: int) -> _Prior:
-        """Return the prior of some parameter, or one without weight."""
-        if known is None:
-            return cls(0, np.zeros(count), np.zeros(count))
-        index, mean, error = known
+    def of(cls, known: tuple[tuple[int, FloatArray, FloatArray], ...], count: int) -> _Prior:
+        """Return the priors of some parameters."""
+        index = [one[0] for one in known]
+        mean, error = (np.array([one[part] for one in known]).reshape(-1, count).T for part in (1, 2))
         usable = np.isfinite(mean) & (error > 0)
         return cls(index, np.where(usable, mean, 0), np.where(usable, 1 / np.where(usable, error, 1), 0))
 
     def cost(self, values: FloatArray, rows: IntArray) -> FloatArray:
         """Return the squared residuals of some of the fits."""
-        return np.asarray((self.weight[rows] * (values[rows, self.index] - self.mean[rows])) ** 2)
+        return np.asarray(np.sum((self.weight[rows] * (values[rows][:, self.index] - self.mean[rows])) ** 2, axis=1))
 
 
 def _echoes(records: Records, bins: IntArray, fit: WindowFits, flags: IntArray, shape: EchoShape) -> Echoes:

@@ -15,7 +15,7 @@ from mitransient_lidar.analysis.waveforms.column_fits import ColumnFit, change_p
 from mitransient_lidar.analysis.waveforms.depth_errors import TYPICAL_SLOPE_VARIANCE, DepthErrors
 from mitransient_lidar.analysis.waveforms.echo_classes import IN_AIR, Detection, EchoClass, decide
 from mitransient_lidar.analysis.waveforms.echo_detection import DetectedEchoes, Echoes, EchoFlag, Records, has_echo
-from mitransient_lidar.analysis.waveforms.first_echoes import SEPARATE
+from mitransient_lidar.analysis.waveforms.first_echoes import OF_DECAY, SEPARATE
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.analysis.waveforms.saturation import longest_run, may_be_second_return, saturated_spans, widen
 from mitransient_lidar.analysis.waveforms.surface_times import (
@@ -519,8 +519,19 @@ def _estimate(
         if waveforms.fading.opaque:
             error = _IN_ECHO * records.power.max(axis=1)
             level, records = (0 * error, error), replace(records, noise=np.hypot(records.noise, error[:, np.newaxis]))
-        surface = found.surface, width, decay, found.flags[0], shape, waveforms.onset, level
-        fits = [echo_fits.gaussian_surface(records, *surface, reflects=waveforms.reflects)]
+        # Where the column is too short for a fit, its decay is as uncertain as that of any water.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = np.where(column.decay > 0, column.decay_stderr / column.decay, np.inf)
+        known = relative < OF_DECAY
+        rate = np.where(known, column.decay, waveforms.fading.typical_rate)
+        relative = np.where(known, relative, OF_DECAY)
+        surface = found.surface, width, rate, found.flags[0], shape, waveforms.onset, level
+        _, following = found.neighbours(0)
+        reflects = waveforms.reflects
+        first = echo_fits.gaussian_surface(
+            records, *surface, reflects=reflects, decay_error=relative, following=following
+        )
+        fits = [first]
         for number, (place, flag) in enumerate(places[1:], 1):
             around = found.neighbours(number)
             fit = echo_fits.gaussian_echo(records, place, width, decay, flag, shape, after=found.surface, around=around)

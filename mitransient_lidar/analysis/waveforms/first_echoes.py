@@ -17,6 +17,8 @@ from mitransient_lidar.core.validation import FloatArray
 
 #: Separation from which surface and bottom are two echoes, in echo widths.
 SEPARATE = 1.8
+#: Standard deviation of the logarithm of a column's decay, as of Jerlov's waters.
+OF_DECAY = 1.0
 
 _DELAYS = 32  # delays of a bottom that are tried
 _SHORTEST_NS = 0.05  # delay of a bottom that is fitted [ns]
@@ -29,13 +31,13 @@ _BOTH = 0.3  # delay from which the peak may be that of the surface or of the bo
 # Prior distributions: heights of land and depths of bottoms that are as likely as each other [m], and shares.
 _HIGHEST, _DEEPEST, _OF_LAND, _WITHOUT_BOTTOM = 20.0, 10.0, 0.5, 0.3
 _LEAST_COLUMN = 1e-5  # of a column of unknown water, relative to the peak
-_FASTEST, _WITH_DECAY = 10.0, 5  # largest decay of a column, over the typical one; parameters of a surface
+_FARTHEST_DECAY = 2.3  # largest logarithm of a column's decay over the typical one
 _LEVELS, _CLEAR = 64, 3.0  # tried levels of a column, and standard errors from which on its fit alone counts
 _SIGNIFICANT = 5.0  # standard errors of the height of a surface that is told apart
 _LEAST_SPREAD = 0.02  # standard deviation of a surface's time [ns]
-# Light that a bottom sends back to itself by total reflection at the surface: times between which it counts, over those
-# of the depth, and their steps; and the prior of the bottom's reflectance: mean, error, largest.
-_AGAIN, _STEPS, _REFLECTANCE = (1.34, 12.0), 12, (0.2, 0.15, 0.6)
+# Light that a bottom sends back to itself by total reflection at the surface: times over those of the depth between
+# which it counts, from 1/sqrt(1 - 1/n^2) on, their steps, and the prior of the reflectance: mean, error, largest.
+_AGAIN, _STEPS, _REFLECTANCE = (1.5, 12.0), 12, (0.2, 0.15, 0.6)
 # Errors of samples over waves, and of those of a column, which are below a share of the peak.
 _OF_WAVES, _OF_FOCUSING, _FAINT = 0.1, 0.3, 0.05
 _FIRST_BLUR = 0.01  # first guess of the variance of a blur, relative to the largest
@@ -134,20 +136,20 @@ def first_echoes(
     -----
     All possibilities consist of the known pulse P, blurred by a Gaussian of free width for what slopes do, and of its
     integral for a column of constant backscattering. Land is A P(t - t1). A surface is A P(t - t1) and a column from t1
-    on, which decays at a rate of up to ten times the typical one. A bottom at t1 + d is A P(t - t1 - d), a column from
-    t1 to t1 + d, and the echo A' P(t - t1) of its surface; heights are not negative. It is followed by its light
-    that is totally reflected at the surface and meets the bottom again: of a Lambertian bottom of the reflectance rho,
-    2 rho d^2/u^3 per time at u > 1.34 d behind it (below a level surface, later passages left out). Samples have their
-    noise and the error of the pulse's shape; over waves of 10 %.
+    on, which decays. A bottom at t1 + d is A P(t - t1 - d), a column from t1 to t1 + d, and the echo A' P(t - t1) of
+    its surface; heights are not negative. Fits keep the logarithm of a column's decay within about 1 of that of the
+    typical one. A bottom is followed by its light that is totally reflected at the surface and meets the bottom again:
+    of a Lambertian bottom of the reflectance rho, 2 rho d^2/u^3 per time at u > 1.5 d behind it (below a level surface,
+    later passages left out). Samples have their noise and the error of the pulse's shape; over waves of 10 %.
 
     The probabilities are those of Bayes' theorem with these prior distributions: land and water are as likely; heights
     of land are uniform up to 20 m above the surface, depths of bottoms up to 10 m; the surface has the normal
-    distribution of its level; three waters in ten show no bottom; logarithms of a column's level are uniform from that
-    of the clearest water to the peak. Land is thus what stands above the surface, or what has no column where even the
-    clearest water would show one. The echoes of surface and column beside a bottom cost the volume of their parameters
-    (Laplace's approximation). Depths are means over 32 delays d up to that at which the surface is 4 standard
-    deviations above its level, or from the fit of all parameters where the surface has an echo of its own; errors
-    include the spread of these delays.
+    distribution of its level; three waters in ten show no bottom; decays of columns are uniform up to ten times the
+    typical one, and logarithms of their levels from that of the clearest water to the peak. Land is thus what stands
+    above the surface, or what has no column where even the clearest water would show one. The echoes of surface and
+    column beside a bottom cost the volume of their parameters (Laplace's approximation). Depths are means over 32
+    delays d up to that at which the surface is 4 standard deviations above its level, or from the fit of all
+    parameters where the surface has an echo of its own; errors include the spread of these delays and their spacing.
     """
     level, count = priors.level, len(bins)
     spread = np.maximum(level.stderr_ns, _LEAST_SPREAD)
@@ -172,8 +174,7 @@ def first_echoes(
     log_sea = np.log((1 - _OF_LAND) * _WITHOUT_BOTTOM) - 0.5 * sea.cost
     log_sea += _log_normal(arrival + sea.values[:, 0], level.time_ns, spread)
     log_sea += _log_column(sea, priors.least_column, fits.peak)
-    decay_error = np.where(_error(sea, 4) > 0, _error(sea, 4), np.inf)
-    log_sea += np.log(np.minimum(np.sqrt(2 * np.pi) * decay_error / (_FASTEST * priors.decay), 1.0))
+    log_sea += _log_decay(sea, 4)
 
     tried = fits.bottoms(delays)
     bottom_ns = arrival + np.stack([one.values[:, 0] for one in tried])
@@ -181,12 +182,13 @@ def first_echoes(
     prior = np.log((1 - _OF_LAND) * (1 - _WITHOUT_BOTTOM) * priors.depth_per_ns / _DEEPEST)
     posterior = prior + _log_normal(surface_ns, level.time_ns, spread)
     posterior += np.stack([-0.5 * one.cost - _occam(one) for one in tried])
-    posterior += np.log(np.gradient(np.concatenate([zero[np.newaxis], delays]), axis=0)[1:])
+    steps = np.gradient(np.concatenate([zero[np.newaxis], delays]), axis=0)[1:]
+    posterior += np.log(steps)
     best = np.argmax(posterior, axis=0)
     # Where the surface has an echo of its own, the delay is much better known than those that are tried.
     fit = _chosen(tried, best)
     free = fits.bottom(fit.values[:, 0], np.take_along_axis(delays, best[np.newaxis], axis=0)[0], start=fit.values)
-    delay, error = free.values[:, 6], _error(free, 6)
+    delay, error = free.values[:, 7], _error(free, 7)
     distinct = free.good & (free.values[:, 3] > _SIGNIFICANT * _error(free, 3)) & (delay > _SHORTEST_NS) & (error > 0)
     own_ns = arrival + free.values[:, 0]
     of_free = prior + _log_normal(own_ns - delay, level.time_ns, spread) - 0.5 * free.cost - _occam(free)
@@ -200,14 +202,15 @@ def first_echoes(
     weight = np.exp(posterior - logsumexp(posterior, axis=0))
     noise = np.stack([_error(one, 0) for one in tried])
     time, time_error = _mean(weight, bottom_ns, noise)
-    top, top_error = _mean(weight, surface_ns, noise)
+    # Delays between those that are tried are as likely as these.
+    top, top_error = _mean(weight, surface_ns, np.hypot(noise, steps / np.sqrt(12)))
     area = pulse.area_ns
     bottom = _echo(_chosen([land, fit], np.where(dry, 0, 1)), area, shape, 0, time, time_error)
     # The height of an echo that may include a surface is that of both, whose error is that of one.
     bottom = replace(bottom, amplitude_stderr=_error(land, 2))
     distinct_bottom = _echo(free, area, shape, 0, own_ns, _error(free, 0))
     bottom = _where(distinct, distinct_bottom, _where(dry, own, bottom))
-    own_error = np.sqrt(np.maximum(_error(free, 0) ** 2 + error**2 - 2 * free.covariance[:, 0, 6], 0))
+    own_error = np.sqrt(np.maximum(_error(free, 0) ** 2 + error**2 - 2 * free.covariance[:, 0, 7], 0))
     surface = _echo(free, area, shape, 1, own_ns - delay, own_error).known_only(distinct)
     surface_ns, surface_stderr = np.where(distinct, (own_ns - delay, own_error), (top, top_error))
     return FirstEchoes(chance, bottom, surface, *(np.where(dry, np.nan, one) for one in (surface_ns, surface_stderr)))
@@ -218,8 +221,9 @@ class _Fits:
     """Fits of the possibilities to samples; times count from the arrival of an ideal echo with its peak at the bin.
 
     Parameters are the time [ns] and the variance of the blur [ns^2] of bottom or land, its height, and the heights of
-    the surface's echo and of the column, and perhaps the delay [ns]; or of a surface, its height, the height of the
-    column and its decay [1/ns].
+    the surface's echo and of the column, the relative height of light that meets the bottom again, the logarithm of the
+    column's decay over the typical one, and perhaps the delay [ns]; or of a surface, its height, the height of the
+    column and this logarithm.
     """
 
     data: Windows
@@ -277,7 +281,8 @@ class _Fits:
         pulse, area, free = self.pulse, self.pulse.area_ns, start is not None
         half, blur = 0.5 * self.peak, np.full(time.shape, _FIRST_BLUR * self.pulse.variances[-1])
         mean, deviation, largest = _REFLECTANCE
-        first = np.stack([time, blur, half, half * surface, 0.01 * half * surface, 0 * half + mean * surface], axis=1)
+        none = 0 * half
+        first = np.stack([time, blur, half, half * surface, 0.01 * half * surface, none + mean * surface, none], axis=1)
         if start is not None:
             first = np.column_stack([start, delay])
         edges = np.geomspace(*_AGAIN, _STEPS + 1)
@@ -285,14 +290,15 @@ class _Fits:
         rises = np.diff(density, prepend=0.0, append=0.0)
 
         def model(p: FloatArray, u: FloatArray, apart: FloatArray) -> tuple[FloatArray, FloatArray]:
-            time, blur, height, top, column, again = (p[:, i : i + 1] for i in range(6))
-            apart = p[:, 6:] if free else apart
+            time, blur, height, top, column, again, q = (p[:, i : i + 1] for i in range(7))
+            apart = p[:, 7:] if free else apart
             echo, slope, by_blur = pulse.blurred(u - time, blur)
             if not surface:
                 none = np.zeros_like(echo)
-                return height * echo, np.stack([-height * slope, height * by_blur, echo, none, none, none], axis=1)
+                return height * echo, np.stack([-height * slope, height * by_blur, echo, *[none] * 4], axis=1)
             begins, ends = pulse.plain(u - time + apart), pulse.plain(u - time)
-            fall, falls = self.priors.column(u - time + apart, self.priors.decay)
+            decay = self.priors.decay * np.exp(q)
+            fall, falls = self.priors.column(u - time + apart, decay)
             inside = (begins[1] - ends[1]) / area
             lit = fall * inside
             by_delay = top * pulse.plain_slope(u - time + apart) + column * (fall * begins[0] / area + falls * inside)
@@ -306,13 +312,14 @@ class _Fits:
                 stretched += rise * per_delay * (edge * power + passed * per_delay)
             by_time -= height * again * falling
             by_delay -= height * again * stretched
-            parts = [by_time, height * by_blur, echo + again * second, begins[0], lit, height * second]
+            by_decay = -column * decay * np.maximum(u - time + apart, 0) * lit
+            parts = [by_time, height * by_blur, echo + again * second, begins[0], lit, height * second, by_decay]
             parts += [by_delay] if free else []
             return height * (echo + again * second) + top * begins[0] + column * lit, np.stack(parts, axis=1)
 
-        known = (5, np.full(time.shape, mean), np.full(time.shape, deviation)) if surface else None
-        limit = np.array([np.inf] * 3 + [np.inf if surface else 0.0] * 2 + [largest * surface] + [np.inf] * free)
-        return self._fit(model, first, delay, limit, known)
+        known = ((5, np.full(time.shape, mean), np.full(time.shape, deviation)),) if surface else ()
+        limit = [np.inf] * 3 + [np.inf if surface else 0.0] * 2 + [largest * surface]
+        return self._fit(model, first, delay, limit, 6, known)
 
     def surface(self) -> WindowFits:
         """Fit a surface and the column behind it."""
@@ -320,41 +327,43 @@ class _Fits:
         blur = np.full(self.peak.shape, _FIRST_BLUR * self.pulse.variances[-1])
 
         def model(p: FloatArray, u: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
-            time, blur, height, column, decay = (p[:, i : i + 1] for i in range(5))
+            time, blur, height, column, q = (p[:, i : i + 1] for i in range(5))
+            decay = self.priors.decay * np.exp(q)
             echo, slope, by_blur = pulse.blurred(u - time, blur)
             power, inside = pulse.plain(u - time)
             fall, falls = self.priors.column(u - time, decay)
             lit = fall * inside / area
             by_time = -height * slope - column * (fall * power + falls * inside) / area
-            by_decay = -column * np.maximum(u - time, 0) * lit
+            by_decay = -column * decay * np.maximum(u - time, 0) * lit
             return height * echo + column * lit, np.stack([by_time, height * by_blur, echo, lit, by_decay], axis=1)
 
-        first = np.stack([none, blur, self.peak, 0.01 * self.peak, self.priors.decay + none], axis=1)
-        return self._fit(model, first, none, np.array([np.inf] * 4 + [_FASTEST * self.priors.decay]))
+        first = np.stack([none, blur, self.peak, 0.01 * self.peak, none], axis=1)
+        return self._fit(model, first, none, [np.inf] * 4, 4)
 
     def _fit(
         self,
         model: Model,
         start: FloatArray,
         rate: FloatArray,
-        most: FloatArray,
-        known: tuple[int, FloatArray, FloatArray] | None = None,
+        most: list[float],
+        decay: int,
+        known: tuple[tuple[int, FloatArray, FloatArray], ...] = (),
     ) -> WindowFits:
-        """Fit a model with the largest values of its parameters, and perhaps with what is known of one of them."""
-        size, width = start.shape[1], self.data.width
-        lowest, highest = np.zeros(start.shape), np.tile(most, (len(start), 1))
+        """Fit a model with the largest values of its parameters before the decay, and what is known of some of them."""
+        width, none = self.data.width, np.zeros(len(start))
+        lowest, highest = np.zeros(start.shape), np.full(start.shape, np.inf)
+        highest[:, :decay] = most
         lowest[:, 0], highest[:, 0] = -self.longest - width, self.longest + width
         highest[:, 1] = self.pulse.variances[-1]
-        if size > 6:
-            lowest[:, 6], highest[:, 6] = _SHORTEST_NS, self.longest
+        lowest[:, decay], highest[:, decay] = -_FARTHEST_DECAY, _FARTHEST_DECAY
         unit = np.full(start.shape, width)
         unit[:, 1] = highest[:, 1]
-        unit[:, 5:6] = 1.0
-        unit[:, 2:5] = np.where(self.peak > 0, self.peak, 1.0)[:, np.newaxis]
-        if size == _WITH_DECAY:
-            unit[:, 4] = self.priors.decay
+        unit[:, 2:decay] = np.where(self.peak > 0, self.peak, 1.0)[:, np.newaxis]
+        unit[:, 5:7] = unit[:, decay] = 1.0
+        if start.shape[1] > decay + 1:
+            lowest[:, -1], highest[:, -1] = _SHORTEST_NS, self.longest
         every = np.ones(len(start), dtype=bool)
-        data = replace(self.data, rate=rate[:, np.newaxis], known=known)
+        data = replace(self.data, rate=rate[:, np.newaxis], known=(*known, (decay, none, none + OF_DECAY)))
         return fit_windows(model, start, data, self.peak, every, limits=Limits(lowest, highest, unit))
 
 
@@ -372,9 +381,27 @@ def _error(fit: WindowFits, index: int) -> FloatArray:
 
 
 def _occam(fit: WindowFits) -> FloatArray:
-    """Return the logarithms of the prior volumes of the heights of surface and column over those of their errors."""
-    ratios = [fit.values[:, index] / np.maximum(_error(fit, index), 1e-300) for index in (3, 4)]
-    return np.asarray(np.sum([np.log1p(np.minimum(ratio, 1e12)) for ratio in ratios], axis=0))
+    """Return logarithms of prior volumes over errors, of the heights of surface and column, and of the decay."""
+    covariance, total = fit.covariance, -_log_decay(fit, 6)
+    known = np.maximum(covariance[:, 6, 6], 1e-300)
+    for index in (3, 4):
+        # That of a height with the decay as fitted.
+        variance = np.nan_to_num(covariance[:, index, index] - covariance[:, index, 6] ** 2 / known)
+        ratio = fit.values[:, index] / np.sqrt(np.maximum(variance, 1e-300))
+        total += np.log1p(np.minimum(ratio, 1e12))
+    return total
+
+
+def _log_decay(fit: WindowFits, index: int) -> FloatArray:
+    """Return the logarithm of a column's prior over all decays, relative to its density at the fitted one.
+
+    Decays are as likely as each other up to ten times the typical one; the fit's own prior does not count.
+    """
+    error, q = _error(fit, index), fit.values[:, index]
+    # Precision of the samples alone.
+    precision = 1 / np.where(error > 0, error, OF_DECAY) ** 2 - 1 / OF_DECAY**2
+    density = q - _FARTHEST_DECAY + 0.5 * np.log(2 * np.pi / np.maximum(precision, 1e-12))
+    return np.asarray(np.minimum(density + 0.5 * (q / OF_DECAY) ** 2, 0.0))
 
 
 def _log_normal(time: FloatArray, middle: FloatArray, spread: FloatArray) -> FloatArray:

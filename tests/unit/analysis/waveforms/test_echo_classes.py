@@ -41,7 +41,7 @@ def land(height, reflectance=0.2, blur=0.0):
     return pulse(SURFACE - 2 / C * height, UNIT * reflectance, np.hypot(SIGMA, blur))
 
 
-def water(depth, glint=0.0, reflectance=0.2, level=0.0, attenuation=K, backscattering=BB):
+def water(depth, glint=0.0, reflectance=0.2, level=0.0, attenuation=K, backscattering=BB, sigma=SIGMA):
     """Power of a surface with a height [m], a column and a bottom at a depth below it [m].
 
     The glint is relative to a bottom of no depth. Light of the bottom that the surface reflects totally meets it again:
@@ -51,18 +51,18 @@ def water(depth, glint=0.0, reflectance=0.2, level=0.0, attenuation=K, backscatt
     delay = 2 * N * depth / C
 
     def onset(at):
-        return exponnorm.pdf(TIME, 1 / (rate * SIGMA), loc=at, scale=SIGMA) / rate
+        return exponnorm.pdf(TIME, 1 / (rate * sigma), loc=at, scale=sigma) / rate
 
     column = UNIT * np.pi * backscattering / (2 * np.pi) * C0 / (2 * N) * 0.96
     column = column * np.maximum(onset(surface) - np.exp(-rate * delay) * onset(surface + delay), 0)
     first = UNIT * reflectance * 0.96 / N**2 * np.exp(-2 * attenuation * depth)
     total = 1 - 1 / N**2
     cosines = np.sqrt(total * (np.arange(400) + 0.5) / 400)
-    again = sum(pulse(surface + delay * (1 + 1 / one), first * reflectance * total / 400) for one in cosines)
-    return pulse(surface, UNIT * reflectance * glint) + column + pulse(surface + delay, first) + again
+    again = sum(pulse(surface + delay * (1 + 1 / one), first * reflectance * total / 400, sigma) for one in cosines)
+    return pulse(surface, UNIT * reflectance * glint, sigma) + column + pulse(surface + delay, first, sigma) + again
 
 
-def recorded(powers, seed, gain=0.12):
+def recorded(powers, seed, gain=0.12, fwhm=FWHM):
     """Records of the receiver of an instrument, one for each row of powers [W]."""
     values = np.asarray(powers)
     base = results.build(
@@ -71,7 +71,7 @@ def recorded(powers, seed, gain=0.12):
         time=TimeAxis(START, DT, BINS),
         pixel_names=["single"],
         pixel_centres_mrad=np.zeros((1, 2)),
-        attributes=ATTRIBUTES,
+        attributes=ATTRIBUTES | {"pulse_fwhm_ns": fwhm},
     )
     zero, one = np.zeros(1), np.ones(1)
     lines = LinesOfSight(zero, zero, zero, SURFACE * one, zero, C / (2 * N) * one, one)
@@ -109,6 +109,33 @@ def test_turbid_water_without_a_visible_bottom_has_none():
     powers = [water(20, glint, attenuation=k, backscattering=b) for k, b, glint in kinds]
     (_, bottom), _, _ = found(recorded(powers, 7))
     assert (bottom == EchoClass.NONE).all()
+
+
+def test_turbid_water_seen_by_long_pulses_has_no_bottom():
+    """A blurred bottom below a column of a free decay fits such columns as well, with more parameters."""
+    kinds = [(k, b, glint) for k, b in ((0.5, 0.03), (0.75, 0.1)) for glint in (0.0, 0.02)]
+    powers = [water(20, g, attenuation=k, backscattering=b, sigma=4.0 / FWHM_PER_SIGMA) for k, b, g in kinds]
+    (_, bottom), _, _ = found(recorded(powers, 7, fwhm=4.0))
+    assert (bottom == EchoClass.NONE).all()
+
+
+def test_light_that_meets_a_bottom_twice_is_no_bottom():
+    """Without a surface echo, a bottom was the surface, and its second light a bottom 2.5 times as deep."""
+    depths, sigma = np.array([1.2, 1.5, 1.8]), 3.0 / FWHM_PER_SIGMA
+    powers = [water(d, reflectance=0.4, attenuation=0.05, backscattering=1e-3, sigma=sigma) for d in depths]
+    _, depth, error = found(recorded(powers, 8, fwhm=3.0))
+    assert (np.abs(depth - depths) < 3 * error).all()
+    assert (error < 0.2).all()
+
+
+def test_turbid_water_has_depths_with_true_errors():
+    """Pulses are long beside the column, whose decay at a typical rate gave depths up to 28 stated errors too small."""
+    depths, sigma = np.array([0.4, 0.7, 1.0, 1.3]), 4.0 / FWHM_PER_SIGMA
+    powers = [water(d, reflectance=0.4, attenuation=0.75, backscattering=0.1, sigma=sigma) for d in depths]
+    (_, bottom), depth, error = found(recorded(powers, 9, fwhm=4.0))
+    assert np.isin(bottom, [EchoClass.BOTTOM, EchoClass.MERGED]).all()
+    assert (np.abs(depth - depths) < 3 * error).all()
+    assert (error < 0.3).all()
 
 
 @pytest.mark.slow

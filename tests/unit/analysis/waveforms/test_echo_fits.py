@@ -85,6 +85,30 @@ def test_a_surface_low_beside_its_column_has_one_time_with_a_true_error(height, 
         assert np.count_nonzero(found.amplitude / found.amplitude_stderr > 3) <= largest_count(300, 0.005)
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_surfaces_of_turbid_water_have_true_times(known):
+    """The level counts at the peak, where it is a third of that at the surface, and a decay may be a typical one."""
+    fast = 0.15
+    signal, bins, flags = onset(SURFACE, decay=fast), np.full(300, 0), np.zeros(300, int)
+    bins[:] = np.argmax(signal)
+    late = TIME[bins[0]] - SURFACE
+    level = np.full(300, np.exp(-fast * late) if known else np.nan), np.full(300, 0.2 * np.exp(-fast * late))
+    rate, error = (fast, 0.02) if known else (0.03, 1.0)
+    found = gaussian_surface(noisy(signal, 0.003, 300), bins, WIDTH, rate, flags, SHAPE, level=level, decay_error=error)
+    z = (found.time_ns - SURFACE) / found.time_stderr
+    assert np.sqrt(np.mean(z**2)) < 1.8
+
+
+def test_a_bright_echo_near_a_surface_does_not_delay_it():
+    """Two echo widths behind the surface, its rise was the surface's peak, 4 ns late with an error of 0.6 ns."""
+    signal = waveform(0.4, 0.0) + gauss(SURFACE + 2.2 * WIDTH, 5.0)
+    bins, flags = np.full(200, int(np.argmin(np.abs(TIME - SURFACE)))), np.zeros(200, int)
+    following = np.full(200, int(np.argmax(signal)))
+    found = gaussian_surface(noisy(signal, 0.01, 200), bins, WIDTH, DECAY, flags, SHAPE, following=following)
+    assert np.sqrt(np.mean(((found.time_ns - SURFACE) / found.time_stderr) ** 2)) < 2.7
+    assert np.median(found.time_stderr) < 1.0
+
+
 def test_bottom_on_the_column_that_it_ends():
     signal = waveform()
     bins, flags = np.full(COUNT, int(np.argmin(np.abs(TIME - BOTTOM)))), np.zeros(COUNT, int)
@@ -133,7 +157,8 @@ def test_a_column_that_waves_focus_does_not_delay_the_surface():
     column = np.convolve(shape, blur / blur.sum(), "same")
     signal = np.interp(TIME, fine + SURFACE, column)
     bins, flags = np.full(300, int(np.argmax(signal))), np.zeros(300, int)
-    level = np.ones(300), np.full(300, 0.2)
+    late = TIME[bins[0]] - SURFACE
+    level = np.full(300, np.exp(-DECAY * late)), np.full(300, 0.2)
     onset = ColumnOnset.of(focusing, 0.106, SHAPE.sigma_of(3 * WIDTH))
     for glint in (0.0, 1.0):
         records = noisy(signal + gauss(SURFACE, glint), 0.05, 300)
