@@ -34,7 +34,7 @@ IN_AIR = 0.5e-9 * C0
 _FAR = 4.0  # standard deviations of the surface's time beyond which an echo before others stands above the water
 _APART = 1.2  # least separation of two echoes of which the first one stands above the water, in echo widths
 _WEAK, _FAR_APART = 15.0, 8.0  # height of a weak first echo over the noise, and farthest others behind it, in widths
-_SURE, _OVER_BOTTOM = 0.6, 0.9  # least one of a surface without a column, and where it may rather be a bottom
+_SURE, _OVER_BOTTOM = 0.5, 0.9  # least one of a surface without a column, and where it may rather be a bottom
 _TWICE, _SECOND = 0.1, 5.0  # of a peak, light that meets the bottom twice, and its farthest distance in echo widths
 # Its delays over those of the bottom, and its largest height times delay over width.
 _RETURNS, _BRIGHTEST = (2.2, 3.2), 0.5
@@ -130,7 +130,7 @@ def decide(
     An echo that is more than 4 standard deviations before the surface's level, and 1.2 echo widths before others, is an
     object above the water. First echoes without others, or with others nearer than 1.8 echo widths, are those of
     `first_echoes.first_echoes`, unless they are at the surface's level and a column follows them. A surface without a
-    column needs a probability of 60 %, or of 90 % where it is a bottom rather than land. In the near infrared, where
+    column needs a probability of 50 %, or of 90 % where it is a bottom rather than land. In the near infrared, where
     column and bottom are part of the surface's echo, a first echo is land or the surface, and nothing follows the
     surface.
 
