@@ -191,7 +191,7 @@ def forecast(
         ``order`` that they meet, where at least half of the bottoms are found; and ``deepest``, the depth to which
         these are found in the water of the cell [m], NaN if it lies below the table. All are NaN without data, above
         0.5 m, and on land, where the order is -2; it is -1 where the bottom is lost. The table is in ``table_depth``,
-        ``table_found`` and ``table_tvu``, over ``water`` and ``node``.
+        ``table_found`` and ``table_tvu``, over ``water`` and ``node``; the receiver's gain in the attribute ``gain``.
 
     Raises
     ------
@@ -244,7 +244,7 @@ def forecast(
     if "depth" not in place.coords:
         maps["depth"] = dims, place.depth
     attributes = {
-        **{key: tables[0].attrs[key] for key in ("instrument", "altitude", "off_nadir_deg", "wind_speed")},
+        **{key: tables[0].attrs[key] for key in ("instrument", "altitude", "off_nadir_deg", "wind_speed", "gain")},
         **{"pointing_mrad": pointing_mrad, "position_m": position_m, "height_m": height_m, "seed": seed},
         **{"title": f"Forecast of {instrument}", "source": f"mitransient-lidar {__version__}", "site": str(site)},
         **{"shots": shots, "records": records, "water": "" if given is None else f"{name} {given}"},

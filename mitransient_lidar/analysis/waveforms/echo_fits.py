@@ -449,7 +449,7 @@ class _Prior:
     def of(cls, known: tuple[tuple[int, FloatArray, FloatArray], ...], count: int) -> _Prior:
         """Return the priors of some parameters."""
         index = [one[0] for one in known]
-        mean, error = (np.array([one[part] for one in known]).reshape(-1, count).T for part in (1, 2))
+        mean, error = (np.array([one[part] for one in known]).reshape(len(known), count).T for part in (1, 2))
         usable = np.isfinite(mean) & (error > 0)
         return cls(index, np.where(usable, mean, 0), np.where(usable, 1 / np.where(usable, error, 1), 0))
 

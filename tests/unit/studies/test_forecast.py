@@ -35,7 +35,7 @@ def tables(monkeypatch):
             attributes = {"instrument": "it", "altitude": 150.0, "refractive_index": 1.34, "divergence_mrad": 2.0}
             coords = {"off_nadir_deg": [20.0], "wind_speed": [5.0], "water": [0], "depth": depth}
             coords |= {"estimator": ["gaussian"], "pixel": ["single"]}
-            return xr.Dataset(data, coords, {**attributes, "off_nadir_deg": 20.0, "wind_speed": 5.0})
+            return xr.Dataset(data, coords, {**attributes, "off_nadir_deg": 20.0, "wind_speed": 5.0, "gain": 0.5})
 
     monkeypatch.setattr(study, "_Bottoms", Bottoms)
 

@@ -9,7 +9,7 @@ from significance import largest_count, largest_z, variance_limits
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.receiver import detect_waveforms
-from mitransient_lidar.analysis.waveforms import echo_table
+from mitransient_lidar.analysis.waveforms import echo_table, first_echoes
 from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
 from mitransient_lidar.analysis.waveforms.surface_times import SurfaceLevel
 from mitransient_lidar.core.constants import C0
@@ -157,6 +157,15 @@ def test_error_rates_over_drawn_records(count, seed):
     np.testing.assert_allclose(depth[dry], -heights, atol=0.02)
     assert np.mean(z**2) < variance_limits(np.count_nonzero(wet))[1]
     assert np.abs(z).max() < largest_z(count, count)
+
+
+def test_depths_do_not_depend_on_how_many_delays_are_fitted_at_once(monkeypatch):
+    """The shortest delay alone once had no fit whose peak is that of the surface, and ended in a numpy error."""
+    record = recorded([water(0.3), water(1.0, glint=0.2)], 1)
+    together = found(record)
+    monkeypatch.setattr(first_echoes, "_AT_ONCE", 1)
+    for one, other in zip(together, found(record), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
 def test_a_level_known_from_elsewhere_gives_the_depth_of_a_bottom_without_a_surface():
