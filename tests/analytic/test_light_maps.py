@@ -128,7 +128,8 @@ def test_shots_that_light_a_target_are_merged():
 @pytest.mark.slow
 def test_bottoms_of_narrow_beams_have_little_noise_and_state_it():
     """Energies of 64 seeds, two passes each: 12 looks at the bottom for each ray instead of 48 spread by 8.4 %."""
-    places, params = np.zeros((64, 2)), {"wind_speed": 3, "altitude": 600, "jerlov": "1C", "cube_x": 60, "bottom_ripple_height": 0}
+    params = {"wind_speed": 3, "altitude": 600, "jerlov": "1C", "cube_x": 60, "bottom_ripple_height": 0}
+    places = np.zeros((64, 2))
     given = {"light": "maps", "instrument": "riegl_vq880g2", "components": True, "check": False}
     batches = ShotScene("flight", params, places, **given).batches(2, 1.0, None)
     renderer = batches.at(ShotPoses(places))(2)
