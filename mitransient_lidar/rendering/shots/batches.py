@@ -113,14 +113,8 @@ class ShotPoses:
     def scene_part(self, shapes: mi.Scene, positions: FloatArray | None, aim: FloatArray) -> ScenePart:
         """Return shapes as the shots meet them.
 
-        Parameters
-        ----------
-        shapes
-            The shapes.
-        positions
-            Points (x, y) among them of the shots' places [m], shape (shots, 2); None for shapes that go with the lidar.
-        aim
-            Place (x, y) of the lidar in its frame [m], shape (2,).
+        `shapes`: the shapes. `positions`: points (x, y) among them of the shots' places [m], shape (shots, 2); None for
+        shapes that go with the lidar. `aim`: place (x, y) of the lidar in its frame [m], shape (2,).
         """
         if positions is None:
             positions = np.broadcast_to(aim, (len(self), 2))
