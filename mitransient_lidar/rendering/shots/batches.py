@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
@@ -25,13 +24,11 @@ from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer, li
 from mitransient_lidar.transport.medium.bubbles import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.paths.passes import PassRenderer
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.probe import land_of_shots
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
 from mitransient_lidar.transport.solids import scene_of_shapes
-
-if TYPE_CHECKING:
-    from mitransient_lidar.transport.paths.passes import PassRenderer
 
 #: Paths of all shots in a launch, and time bins of all their pixels.
 _PATHS, _BINS = 2**17, 2**24
@@ -116,14 +113,8 @@ class ShotPoses:
     def scene_part(self, shapes: mi.Scene, positions: FloatArray | None, aim: FloatArray) -> ScenePart:
         """Return shapes as the shots meet them.
 
-        Parameters
-        ----------
-        shapes
-            The shapes.
-        positions
-            Points (x, y) among them of the shots' places [m], shape (shots, 2); None for shapes that go with the lidar.
-        aim
-            Place (x, y) of the lidar in its frame [m], shape (2,).
+        `shapes`: the shapes. `positions`: points (x, y) among them of the shots' places [m], shape (shots, 2); None for
+        shapes that go with the lidar. `aim`: place (x, y) of the lidar in its frame [m], shape (2,).
         """
         if positions is None:
             positions = np.broadcast_to(aim, (len(self), 2))

@@ -127,10 +127,7 @@ class LightMapRenderer(PassRenderer):
 
     Paths that change more than once between down and up are left out, and the shadows of solids in the beam.
 
-    Parameters
-    ----------
-    level
-        Whether the sea is level, with all of its slopes as ripples, as the mean over seas.
+    `level`: whether the sea is level, with all of its slopes as ripples, as the mean over seas.
 
     Raises
     ------
@@ -373,14 +370,9 @@ def light_faintly(scene: LidarScene, target: mi.Shape, places: FloatArray, turns
     In each pixel at most `_SHADOWED` of the beam over a level sea meets the box of the target, widened as waves deflect
     the light.
 
-    Parameters
-    ----------
-    scene, target
-        The lidar's scene, and a target of it.
-    places
-        Points (x, y) of the shots among the shapes [m], shape (shots, 2).
-    turns
-        Cosine and sine of their rotations about the vertical, shape (shots, 2); None without any.
+    `scene`, `target`: the lidar's scene, and a target of it. `places`: points (x, y) of the shots among the shapes [m],
+    shape (shots, 2). `turns`: cosine and sine of their rotations about the vertical, shape (shots, 2); None without
+    any.
     """
     low, high = box_of(target)
     rays = Rays.of_beam(scene, scene.transmitter)
