@@ -59,6 +59,7 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
         - ``return_number``, ``number_of_returns``: 1 to 15, of a pulse in a channel;
         - ``scan_angle_deg``: angle of the pulse from nadir, -180 to 180, positive to the right of the heading;
         - ``line``: number of the flight line, 0 to 65535;
+        - ``transmitter``, the user data: 0 green, also if it is missing, 1 the infrared channel;
         - ``pixel``, 0 to 65535, and ``shot``, 0 to 2^32 - 1;
         - ``quality``: sum of `products.Quality`, 0 to 255; ``withheld``: whether maps should leave the point out;
         - ``depth``, negative on land, ``depth_uncertainty``, ``horizontal_uncertainty``, ``vertical_uncertainty`` [m],
@@ -183,7 +184,8 @@ def _notes(first: xr.Dataset) -> str:
         f"GPS time: {TIME_NOTES[_time_system(first)]}. "
         "Class 1 object above the water, 2 land, 40 bottom, 41 water surface, 43 submerged object, "
         "45 no bottom found (flagged synthetic: "
-        "no echo is there). The scanner channel is the pixel, or one of four groups of more pixels. "
+        "no echo is there). User data: 0 green, 1 infrared channel. "
+        "The scanner channel is the pixel, or one of four groups of more pixels. "
         "Return numbers count the echoes of a pulse in one channel; the fifteenth may be several. "
         "Quality: 1 saturated, 2 poor fit, 4 corrected depth, 8 beyond the table of corrections, "
         "16 surface and bottom merged, 32 above the water, 64 class below 90 % probable, 128 surface from infrared. "
@@ -267,6 +269,7 @@ def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float)
         "point_source_id": _whole(points, "line", 0, 2**16 - 1),
         "pixel": _whole(points, "pixel", 0, 2**16 - 1),
         "shot": _whole(points, "shot", 0, 2**32 - 1),
+        "user_data": _whole(points, "transmitter", 0, 255) if "transmitter" in points else np.zeros(kind.shape),
         **extra,
     }
 

@@ -49,6 +49,14 @@ class Pulses(Plan):
 
 
 @dataclass(frozen=True)
+class InfraredLines(Plan):
+    """Pulses of an infrared channel that has a scanner of its own."""
+
+    scanner: Annotated[Mapping[str, Any], Option("Scanner, as of poses.scanner")]
+    pulses: Annotated[Pulses, Option("Pulses")]
+
+
+@dataclass(frozen=True)
 class FlightReceiver(Plan):
     """Receiver of a flight, as of `analysis.receiver.detect_waveforms`, None for that of the instrument."""
 
@@ -79,6 +87,9 @@ class FlightPlan(Plan):
     infrared: Annotated[
         bool, Option("Whether the infrared channel of the instrument sends a pulse with each green one")
     ] = False
+    infrared_lines: Annotated[
+        InfraredLines | None, Option("Scanner and pulses of the infrared channel, if it has lines of its own")
+    ] = None
     parameters: Annotated[Mapping[str, Any], Option("Parameters of the scene, but those of the pose")] = field(
         default_factory=dict
     )
@@ -116,6 +127,10 @@ class FlightPlan(Plan):
         super().__post_init__()
         one_of("estimator", self.estimator, ESTIMATORS)
         one_of("light", self.light, LIGHT)
+        if self.infrared and self.infrared_lines is not None:
+            raise UserError("infrared = true and [infrared_lines] are alternatives: give one of them")
+        if self.infrared_lines is not None:
+            with_infrared(self.instrument, None)
         for name in POSE_PARAMETERS:
             if name in self.parameters:
                 raise UserError(
@@ -125,7 +140,13 @@ class FlightPlan(Plan):
     def of_infrared(self) -> FlightPlan:
         """Return the flight of the infrared channel; raise `UserError` if the instrument has none."""
         _, (channel, parameters) = with_infrared(self.instrument, self.parameters)
-        return replace(self, instrument=channel, parameters=parameters, receiver=FlightReceiver(), infrared=False)
+        if self.infrared_lines is None:
+            return replace(self, instrument=channel, parameters=parameters, receiver=FlightReceiver(), infrared=False)
+        given = json.loads(self.text)
+        lines = given.pop("infrared_lines")
+        own = {key: value for key, value in given.items() if key not in ("receiver", "corrections")}
+        own |= {"instrument": channel, "parameters": parameters, **lines}
+        return FlightPlan.of_file(own, self.folder)
 
     @classmethod
     def read(cls, flight: str | os.PathLike[str]) -> FlightPlan:
