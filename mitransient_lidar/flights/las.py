@@ -52,7 +52,8 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
         - ``gps_time``: time of the pulse [s]; its attribute ``time_system``, of `poses.records.TIME_SYSTEMS`, is
           ``flight`` by default. Those since 1980 become adjusted standard GPS times;
         - ``kind``: class, 0 to 255: 1 an object above the water, 2 land, 40 bottom, 41 water surface, 43 submerged
-          object, 45 no bottom found. The last is flagged as synthetic, since no echo is there;
+          object, 45 no bottom found. The last is flagged as synthetic, since no echo is there. The
+          attribute ``object_class``, 46 or 64, is the class that files have in place of 43, of submerged vegetation;
         - ``intensity``: amplitude, with the attributes ``full_scale``, which becomes 65535, and ``units``; larger ones
           are clipped, negative and missing ones are 0. The scale is that of the first chunk;
         - ``channel``: scanner channel, 0 to 3: the pixel, or a group of pixels where more than four are;
@@ -176,13 +177,20 @@ def _time_system(first: xr.Dataset) -> str:
     return str(first["gps_time"].attrs.get("time_system", "flight"))
 
 
+def _object_class(points: xr.Dataset) -> int:
+    """Return the class of echoes between surface and bottom."""
+    return int(points["kind"].attrs.get("object_class", PointClass.OBJECT))
+
+
 def _notes(first: xr.Dataset) -> str:
     intensity = first["intensity"].attrs
     step = positive("full_scale", intensity["full_scale"]) / _LAST_INTENSITY
+    of_object = _object_class(first)
+    objects = "object" if of_object == PointClass.OBJECT else "vegetation"
     return (
         f"Simulated by mitransient-lidar. Intensity: 1 is {step:.9g} {intensity['units']}. "
         f"GPS time: {TIME_NOTES[_time_system(first)]}. "
-        "Class 1 object above the water, 2 land, 40 bottom, 41 water surface, 43 submerged object, "
+        f"Class 1 object above the water, 2 land, 40 bottom, 41 water surface, {of_object} submerged {objects}, "
         "45 no bottom found (flagged synthetic: "
         "no echo is there). User data: 0 green, 1 infrared channel. "
         "The scanner channel is the pixel, or one of four groups of more pixels. "
@@ -257,7 +265,7 @@ def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float)
         **{name: _coordinate(points, name.lower(), offset) for name, offset in zip("XYZ", offsets, strict=True)},
         "gps_time": finite_array("gps_time", points["gps_time"].values)
         - ADJUSTMENT_S * (_time_system(points) == "gps"),
-        "classification": kind,
+        "classification": np.where(kind == PointClass.OBJECT, _object_class(points), kind),
         "synthetic": kind == PointClass.NO_ECHO,
         "withheld": points["withheld"].values,
         "quality": _whole(points, "quality", 0, 255),

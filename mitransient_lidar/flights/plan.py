@@ -28,12 +28,17 @@ from mitransient_lidar.flights.refracted_paths import PoseErrors
 from mitransient_lidar.loading.instruments import with_infrared
 from mitransient_lidar.physics.receiver.receiver_files import Setting
 from mitransient_lidar.rendering.passes import LIGHT, LightOption
+from mitransient_lidar.results.attributes import PointClass
 
 #: Parameters of the scene that the poses of the pulses replace.
 POSE_PARAMETERS = ("aim_x", "aim_y", "altitude", "off_nadir_deg")
 
 #: Most pulses of a flight.
 MOST_PULSES = 1_000_000
+
+#: Classes of echoes between surface and bottom: objects, vegetation of the draft of the second bathymetric profile of
+#: LAS (46), and vegetation as NOAA marked it before (64).
+OBJECT_CLASSES = (int(PointClass.OBJECT), 46, 64)
 
 #: Largest difference of coordinates of one place [m], that of the rounding in files.
 SAME_PLACE_M = 1e-3
@@ -114,6 +119,10 @@ class FlightPlan(Plan):
         float | None,
         positive_option("Longest time for the passes of a batch; shots that it ends have other bits elsewhere", "s"),
     ] = None
+    object_class: Annotated[
+        int,
+        Option("LAS class of echoes between surface and bottom: 43 objects, 46 or 64 submerged vegetation", 0, 255),
+    ] = PointClass.OBJECT
     seed: Annotated[int, Option("Seed of renders and of the receiver's noise", 0, 2**31)] = 1
     still_sea: Annotated[bool, Option("Whether the waves do not move")] = False
     crs: Annotated[str | None, Option("Coordinate system of the points, such as EPSG:32633")] = None
@@ -127,6 +136,9 @@ class FlightPlan(Plan):
         super().__post_init__()
         one_of("estimator", self.estimator, ESTIMATORS)
         one_of("light", self.light, LIGHT)
+        if self.object_class not in OBJECT_CLASSES:
+            allowed = ", ".join(map(str, OBJECT_CLASSES))
+            raise UserError(f"object_class = {self.object_class} must be one of {allowed}")
         if self.infrared and self.infrared_lines is not None:
             raise UserError("infrared = true and [infrared_lines] are alternatives: give one of them")
         if self.infrared_lines is not None:

@@ -383,6 +383,7 @@ def write_files(flown: Flown, plan: FlightPlan, points: xr.Dataset, folder: Path
     placed = points.copy()
     for name, first in zip("xyz", plan.origin, strict=True):
         placed[name] = placed[name] + first
+    placed["kind"].attrs["object_class"] = plan.object_class
     placed = with_channels(placed, len(flown.coordinate("pixel")))
     placed["gps_time"].attrs["time_system"] = plan.time_system(flown.values("time_s"))
     # The amplitude of a clipped echo is what its flanks make of it.

@@ -231,6 +231,7 @@ def test_failed_pulses_end_with_exit_code_1(tmp_path, monkeypatch):
         return Outcome(found[-1]["done"], found[-1]["failed"])
 
     monkeypatch.setattr(FlightRenderer, "stacked", fails)
+    monkeypatch.setattr("mitransient_lidar.flights.renderer._BATCH", 2)
     monkeypatch.setattr(workers, "render_in_process", render_here)
     out = run("fly", path, "-o", folder, "--workers", 1, "-q")
     failed = np.count_nonzero(Store(folder / STORE).status() == FAILED)
@@ -245,6 +246,7 @@ def test_command_refuses_bad_flights(tmp_path):
     for wrong, message in (
         (TOML.replace("rate_hz = 320.0", "rate_hz = -1"), "rate_hz = -1"),
         ('crs = "EPSG:999999"' + TOML, "crs = 'EPSG:999999'"),
+        ("object_class = 44" + TOML, "object_class = 44 must be one of 43, 46, 64"),
     ):
         path.write_text(wrong)
         assert_refused(run("fly", path, "-o", tmp_path / "out"), message)
