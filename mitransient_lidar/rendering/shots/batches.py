@@ -20,7 +20,13 @@ from mitransient_lidar.rendering.accumulators import Light
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
 from mitransient_lidar.transport.light_maps.heights import HeightFields
-from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer, light_faintly
+from mitransient_lidar.transport.light_maps.renderer import (
+    REACH_THE_SURFACE,
+    LightMapRenderer,
+    UnsuitedError,
+    light_faintly,
+    over_water,
+)
 from mitransient_lidar.transport.medium.bubbles import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
@@ -398,10 +404,17 @@ def _errors(window: ErrorWindow | None, light: Light) -> FloatArray:
 
 
 def suits_maps(lidar: LidarScene, poses: ShotPoses) -> BoolArray:
-    """Return which shots of a scene that suits light maps light its targets so faintly that maps serve them."""
+    """Return which shots of a scene that suits light maps serve: over water, with faint light on targets."""
     places = poses.places - lidar.frame_origin[:2]
     faint = [light_faintly(lidar, target, places, poses.turns) for target in lidar.targets]
-    return np.all(faint, axis=0) if faint else np.ones(len(poses), dtype=bool)
+    return np.asarray(np.all([over_water(lidar, places, poses.turns), *faint], axis=0))
+
+
+def require_water(lidar: LidarScene, poses: ShotPoses) -> None:
+    """Raise `UnsuitedError` if light maps do not suit shots, since they meet land, or solids near the surface."""
+    dry = ~over_water(lidar, poses.places - lidar.frame_origin[:2], poses.turns)
+    if dry.any():
+        raise UnsuitedError(f"light maps do not suit the scene: {REACH_THE_SURFACE} in {np.count_nonzero(dry)} shots")
 
 
 def share_for_error(error: float) -> float:

@@ -50,6 +50,7 @@ from mitransient_lidar.rendering.shots.batches import (
     MOST_PASSES_FOR_ERROR,
     ReceivedShots,
     ShotPoses,
+    require_water,
     share_for_error,
     suits_maps,
 )
@@ -228,6 +229,8 @@ def render_shots(
     channels: dict[str, Any] = {"components": bool(components), "derivatives": derivatives or (), "light": light}
     try:
         series = ShotScene(scene, params, places, **source, target=target, axis=axis, **channels)
+        if light == "maps" and not merge_unsuited:
+            require_water(series.lidar, ShotPoses(places))
         suits = light == "merging" or not merge_unsuited or bool(suits_maps(series.lidar, ShotPoses(places)).all())
     except UnsuitedError:
         suits = False
