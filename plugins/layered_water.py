@@ -123,14 +123,9 @@ def _read_water(
 
     Raises UserError when a value is not allowed, or two parameters describe one thing.
 
-    Parameters
-    ----------
-    props
-        Plugin parameters, as the manual page describes them.
-    nested
-        Phase functions by name, one for all layers or one for each; may be empty.
-    bubbles
-        Phase function of the bubbles; None for the one by ``plume_backscatter_ratio`` or ``bubble_backscatter``.
+    `props`: plugin parameters, as the manual page describes them. `nested`: phase functions by name, one for all layers
+    or one for each; may be empty. `bubbles`: phase function of the bubbles; None for the one by
+    ``plume_backscatter_ratio`` or ``bubble_backscatter``.
     """
     check_phases(nested if bubbles is None else {**nested, "plume_phase": bubbles})
     read = props.read

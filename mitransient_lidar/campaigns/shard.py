@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import drjit as dr
 import numpy as np
 import numpy.typing as npt
 import psutil
@@ -359,8 +360,6 @@ def _arrays(
 
 def _main() -> None:
     """Render the shard that standard input names."""
-    import drjit as dr
-
     ended = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ended.set())
     order = json.loads(sys.stdin.readline())

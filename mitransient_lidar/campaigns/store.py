@@ -172,16 +172,8 @@ class Store:
     ) -> Store:
         """Return the store; raise `UserError` unless it belongs to a plan.
 
-        Parameters
-        ----------
-        plan
-            Campaign or flight.
-        columns
-            Parameters of its runs, None where they follow from the plan.
-        scene
-            Its current scene.
-        shard_size
-            Runs per shard, None for any.
+        `plan`: campaign or flight. `columns`: parameters of its runs, None where they follow from the plan. `scene`:
+        its current scene. `shard_size`: runs per shard, None for any.
         """
         own, source = self.inputs(slice(0, self.count)), SceneSource.from_attributes(self.attributes["scene"])
         if (

@@ -122,14 +122,8 @@ def render_row(campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str], 
 
     Raises UserError if there is no such run, or it fails.
 
-    Parameters
-    ----------
-    campaign
-        Store folder, a TOML file, or a dict with its contents.
-    row
-        Run number.
-    options
-        Options of `render_shots` instead of the campaign's.
+    `campaign`: store folder, a TOML file, or a dict with its contents. `row`: run number. `options`: options of
+    `render_shots` instead of the campaign's.
     """
     if isinstance(campaign, (str, os.PathLike)) and Path(campaign).is_dir():
         store = Store(campaign)

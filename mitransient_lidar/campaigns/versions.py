@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mitransient_lidar._version import __version__
 from mitransient_lidar.core.errors import UserError
 
 _LOG = logging.getLogger(__name__)
@@ -29,8 +30,6 @@ def own_versions() -> dict[str, str]:
 
     An installation from sources keeps its version while its files change.
     """
-    from mitransient_lidar._version import __version__
-
     return {
         "mitransient-lidar": __version__,
         FILES: _digest(),

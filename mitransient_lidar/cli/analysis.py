@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mitransient_lidar.cli.files import GateFiles, announced, check_figure, check_suffix, check_targets, write_netcdf
-from mitransient_lidar.cli.generator import OUTPUT, Call, Channel, Command, Lidar, Quiet, Waveforms, waveform_selection
+from mitransient_lidar.cli.generator import OUTPUT, Call, Channel, Commands, Lidar, Quiet, Waveforms, waveform_selection
 from mitransient_lidar.cli.messages import exit_if_interrupted, name_subject, reporting
 from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
@@ -21,9 +21,16 @@ if TYPE_CHECKING:
 
     from mitransient_lidar.results.files import Given
 
+COMMANDS = Commands()
+
 _REFUSED = 1  # exit code of a fit that is refused
 
 
+@COMMANDS.add(
+    "Analyse results",
+    "results.gate_stack:train_from_options",
+    "output/table1.nc --start-depth 1 --width-ns 5 --count 8",
+)
 def _gates(
     call: Call,
     stack: Annotated[
@@ -47,7 +54,12 @@ def _gates(
     html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Cut the gates of a train, or take those that are there, and write and draw them."""
+    """Cut gates from a result.
+
+    Writes DIR/<stack>_gates.exr, _gates.png and _depth.png, and prints the paths. A STACK with gates gives
+    <stack>_cut_gates.exr and so on. Without a start, its own gates or camera frames are written and drawn. TIFF
+    and PNG images contain the digital numbers of frames, or energies from 0 to 65535.
+    """
     from mitransient_lidar import results
     from mitransient_lidar.analysis.gates import cut as gating
     from mitransient_lidar.results.gate_stack import has_frames
@@ -82,6 +94,7 @@ def _gates(
         files.write(cut, result, quiet)
 
 
+@COMMANDS.add("Analyse results", "analysis.receiver:detect_waveforms", "output/table1.nc --receiver apd --gain auto")
 def _record(
     call: Call,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: a shot, a series, or gates.")],
@@ -90,7 +103,13 @@ def _record(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Record the waveforms of a file, and write the signals."""
+    """Record the waveforms of a result with a receiver, or its gates with a camera.
+
+    Writes the signals with the noise of detector and electronics, which echoes and view read, and prints how much
+    is saturated. With a converter they are its codes, with scale_factor and add_offset for volts. With auto, the
+    gain or the filter is chosen so that nothing saturates. A camera gives the digital numbers of frames, with the
+    mean, deviation, signal-to-noise ratio and saturation of each pixel and gate.
+    """
     target = output or file.with_name(f"{file.stem}_recorded.nc")
     check_suffix("--output", target, ".nc")
     from mitransient_lidar import results
@@ -105,6 +124,12 @@ def _record(
         typer.echo(line)
 
 
+@COMMANDS.add(
+    "Analyse results",
+    "analysis.waveforms.echo_table:extract",
+    "output/table1_recorded.nc --csv echoes.csv",
+    defaults={"estimators": None},
+)
 def _echoes(
     call: Call,
     file: Annotated[
@@ -137,7 +162,11 @@ def _echoes(
     lidar: Lidar = None,
     quiet: Quiet = False,
 ) -> None:
-    """Print and write the echoes."""
+    """Measure the echoes in the waveforms of a result.
+
+    Lists time, depth, amplitude, energy and width of surface, column, target and bottom echo of every pixel. Errors
+    include noise, and for depths the method, too.
+    """
     if output is not None:
         check_suffix("--csv", output, ".csv")
     elif not table:
@@ -178,6 +207,7 @@ def _echoes(
         typer.echo(f"these are the first {first.sizes['shot']} waveforms: write the echoes of all with --csv OUT")
 
 
+@COMMANDS.add("Analyse results", "analysis.retrieval.retrieve:retrieve", "output/table1.nc")
 def _retrieve(
     call: Call,
     file: Annotated[
@@ -189,7 +219,11 @@ def _retrieve(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Print, write and draw the estimates."""
+    """Retrieve slopes, bottom and water from a result.
+
+    Estimates the sea's slope, the bottom's depth and reflectance, and the water's attenuation from the echoes of
+    FILE; for a series, those of each shot beside the truth.
+    """
     if output is not None:
         check_suffix("--output", output, ".nc")
     check_figure(figure, option="--figure")
@@ -211,6 +245,7 @@ def _retrieve(
             plot_retrieval(found, figure)
 
 
+@COMMANDS.add("Analyse results", "studies.fit:fit", "output/table1.nc --free attenuation,bottom_reflectance")
 def _fit(
     call: Call,
     file: Annotated[
@@ -227,7 +262,14 @@ def _fit(
     lidar: Lidar = None,
     quiet: Quiet = False,
 ) -> None:
-    """Fit, print and write."""
+    """Fit scene parameters to waveforms.
+
+    Weighted least squares with the derivatives of renders. Prints values with standard errors, and writes fit.nc
+    (with covariance, fitted waveform and residuals), fit.csv and fit.png. A fit is refused if its chi-squared
+    exceeds 5 times the expected one, or, with unknown noise, if it leaves 10 % of the samples' sum of squares.
+    Refused fits are printed and written with exit code 1. Ctrl-C ends the fit at its last step, which is printed
+    and written (exit code 130).
+    """
     targets = [output / f"fit.{kind}" for kind in ("nc", "csv", "png")]
     check_targets(output, targets, str(file))
     from mitransient_lidar import results
@@ -246,64 +288,3 @@ def _fit(
     exit_if_interrupted(fitted)
     if fitted.attrs["refused"]:
         raise typer.Exit(_REFUSED)
-
-
-COMMANDS = {
-    "gates": Command(
-        "Analyse results",
-        "results.gate_stack:train_from_options",
-        _gates,
-        """Cut gates from a result.
-
-        Writes DIR/<stack>_gates.exr, _gates.png and _depth.png, and prints the paths. A STACK with gates gives
-        <stack>_cut_gates.exr and so on. Without a start, its own gates or camera frames are written and drawn. TIFF
-        and PNG images contain the digital numbers of frames, or energies from 0 to 65535.
-        """,
-    ),
-    "record": Command(
-        "Analyse results",
-        "analysis.receiver:detect_waveforms",
-        _record,
-        """Record the waveforms of a result with a receiver, or its gates with a camera.
-
-        Writes the signals with the noise of detector and electronics, which echoes and view read, and prints how much
-        is saturated. With a converter they are its codes, with scale_factor and add_offset for volts. With auto, the
-        gain or the filter is chosen so that nothing saturates. A camera gives the digital numbers of frames, with the
-        mean, deviation, signal-to-noise ratio and saturation of each pixel and gate.
-        """,
-    ),
-    "echoes": Command(
-        "Analyse results",
-        "analysis.waveforms.echo_table:extract",
-        _echoes,
-        """Measure the echoes in the waveforms of a result.
-
-        Lists time, depth, amplitude, energy and width of surface, column, target and bottom echo of every pixel. Errors
-        include noise, and for depths the method, too.
-        """,
-        defaults={"estimators": None},
-    ),
-    "retrieve": Command(
-        "Analyse results",
-        "analysis.retrieval.retrieve:retrieve",
-        _retrieve,
-        """Retrieve slopes, bottom and water from a result.
-
-        Estimates the sea's slope, the bottom's depth and reflectance, and the water's attenuation from the echoes of
-        FILE; for a series, those of each shot beside the truth.
-        """,
-    ),
-    "fit": Command(
-        "Analyse results",
-        "studies.fit:fit",
-        _fit,
-        """Fit scene parameters to waveforms.
-
-        Weighted least squares with the derivatives of renders. Prints values with standard errors, and writes fit.nc
-        (with covariance, fitted waveform and residuals), fit.csv and fit.png. A fit is refused if its chi-squared
-        exceeds 5 times the expected one, or, with unknown noise, if it leaves 10 % of the samples' sum of squares.
-        Refused fits are printed and written with exit code 1. Ctrl-C ends the fit at its last step, which is printed
-        and written (exit code 130).
-        """,
-    ),
-}

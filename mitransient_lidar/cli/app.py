@@ -39,44 +39,10 @@ RENAMED = {
 COMMANDS: dict[str, Command] = {
     **render.COMMANDS,
     **campaigns.COMMANDS,
-    **studies.STUDIES,
+    **studies.COMMANDS,
     **results.COMMANDS,
     **analysis.COMMANDS,
-    **campaigns.FIGURES,
     **scenes.COMMANDS,
-}
-
-
-#: Example arguments in each command's help.
-EXAMPLES = {
-    "render": "table1 -D wind_speed=5 --target-error 0.05",
-    "shots": "table1 --count 20 --passes 4 -o output/shots.nc",
-    "frames": "gated_mine --frames 4 --pulse-rate 100 --pass-share 0.1",
-    "passive": "passive_sea --frames 10",
-    "campaign": "bottoms.toml --workers 4",
-    "fly": "palmer",
-    "find-shots": "table1 --slope-sigmas 1.5",
-    "target-signal": "fig13_2x2 --grid 5",
-    "detect": "fig13_2x2 --receiver pmt --depths 6,8,10",
-    "estimate": "table1 --instrument riegl_vq840g",
-    "bounds": "table1 --free attenuation,bottom_depth --over field_of_view_mrad=10,20,40",
-    "beam-spread": "table1 --depths 2,4,8",
-    "fov-sweep": "table1 --fov-mrad 5,20,80",
-    "scattering-orders": "table1 --orders 4",
-    "water": "jerlov 3C",
-    "depth-bias": "riegl_vq840g --winds 0,3 --depths 3,6",
-    "tpu": "riegl_vq840g --altitudes 100,150",
-    "forecast": "riegl_vq840g 1:12 --secchi 6 -D wind_speed=5",
-    "figures": "fig09 fig13",
-    "view": "output/table1.nc -o waveforms.png",
-    "compare": "one/table1.nc other/table1.nc",
-    "gates": "output/table1.nc --start-depth 1 --width-ns 5 --count 8",
-    "record": "output/table1.nc --receiver apd --gain auto",
-    "echoes": "output/table1_recorded.nc --csv echoes.csv",
-    "retrieve": "output/table1.nc",
-    "fit": "output/table1.nc --free attenuation,bottom_reflectance",
-    "info": "output/table1.nc",
-    "bench": "--quick",
 }
 
 
@@ -102,7 +68,7 @@ class _GroupedCommands(TyperGroup):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        made = {name: LazyCommand(name, row, EXAMPLES.get(name)) for name, row in self.commands_of.items()}
+        made = {name: LazyCommand(name, row) for name, row in self.commands_of.items()}
         self.commands = {**made, **self.commands}
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:

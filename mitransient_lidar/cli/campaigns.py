@@ -9,13 +9,16 @@ from typing import Annotated
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
-from mitransient_lidar.cli.generator import OUTPUT, Call, Command, Quiet
+from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, Quiet
 from mitransient_lidar.cli.messages import exit_if_failed, exit_if_interrupted
 from mitransient_lidar.cli.overwriting import replace_freely
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.marks import read_mark
 
+COMMANDS = Commands()
 
+
+@COMMANDS.add("Render", "campaigns.sweep:campaign", "bottoms.toml --workers 4")
 def _campaign(
     call: Call,
     output: Annotated[
@@ -34,7 +37,12 @@ def _campaign(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render a campaign or one of its runs, complete or draw its store."""
+    """Render a campaign of many runs.
+
+    Each run has its own values of scene parameters. Runs use this machine's cores or a Dask cluster, and fill one
+    Zarr store. After an interruption, the same command goes on. Failed runs end it with exit code 1.
+    The documentation's guide Campaigns describes the file.
+    """
     campaign = Path(call.arguments["campaign"])
     given = {name: call.arguments[name] for name in ("workers", "scheduler")} | {"row": row, "show": show or None}
     used = [f"--{name}" for name, value in given.items() if value is not None]
@@ -83,6 +91,7 @@ def _show(store: Path, path: Path) -> None:
     typer.echo("\n".join(describe_campaign(store)))
 
 
+@COMMANDS.add("Render", "flights.fly:fly", "palmer")
 def _fly(
     call: Call,
     output: Annotated[
@@ -91,7 +100,12 @@ def _fly(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Render a flight, draw it, and print the errors of its points."""
+    """Render the pulses of a flight, and write the points and waveforms that its receiver finds.
+
+    Writes points.laz, waveforms.las with waveforms.wdp, pictures, and the store flight.zarr with all pulses.
+    Prints the points' height errors against the truth [cm]. After an interruption, the same command goes
+    on. Failed pulses end it with exit code 1. The documentation's guide Flights describes the file.
+    """
     folder = output or OUTPUT / Path(call.arguments["flight"]).stem
     from mitransient_lidar.campaigns.store import Store
     from mitransient_lidar.flights.fly import STORE
@@ -115,63 +129,3 @@ def _is_of_a_flight(path: Path) -> bool:
     from mitransient_lidar.flights.las_header import is_simulated
 
     return (read_mark(path) or {}).get("command") == "fly" or is_simulated(path)
-
-
-def _figures(
-    call: Call,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for figures and table.")] = OUTPUT / "figures",
-    quiet: Quiet = False,
-) -> None:
-    """Make the figures, and print the statements."""
-    from mitransient_lidar.plots.publication import figures as publication
-    from mitransient_lidar.studies.publication.statements import describe_statements
-
-    chosen = publication.check_names(call.arguments["names"])
-    check_targets(output, [output / f"{name}.png" for name in chosen] + [output / publication.TABLE])
-    made = call(names=chosen, output=output)
-    for path in made.files:
-        typer.echo(path)
-    for line in describe_statements(made.statements):
-        typer.echo(line)
-    if made.interrupted:
-        done = max(len(made.files) - 1, 0)
-        raise KeyboardInterrupt(f"interrupted after {done} of {len(chosen)} figures, which are kept")
-
-
-COMMANDS = {
-    "campaign": Command(
-        "Render",
-        "campaigns.sweep:campaign",
-        _campaign,
-        """Render a campaign of many runs.
-
-        Each run has its own values of scene parameters. Runs use this machine's cores or a Dask cluster, and fill one
-        Zarr store. After an interruption, the same command goes on. Failed runs end it with exit code 1.
-        The documentation's guide Campaigns describes the file.
-        """,
-    ),
-    "fly": Command(
-        "Render",
-        "flights.fly:fly",
-        _fly,
-        """Render the pulses of a flight, and write the points and waveforms that its receiver finds.
-
-        Writes points.laz, waveforms.las with waveforms.wdp, pictures, and the store flight.zarr with all pulses.
-        Prints the points' height errors against the truth [cm]. After an interruption, the same command goes
-        on. Failed pulses end it with exit code 1. The documentation's guide Flights describes the file.
-        """,
-    ),
-}
-
-FIGURES = {
-    "figures": Command(
-        "Scenes and system",
-        "plots.publication.figures:figures",
-        _figures,
-        """Make the figures of the published model again.
-
-        Writes a PNG file for each figure, and a table of the publication's statements with computed numbers, their
-        errors, and whether they hold.
-        """,
-    )
-}

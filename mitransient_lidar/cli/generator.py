@@ -195,16 +195,17 @@ class Call:
 
 @dataclass(frozen=True)
 class Command:
-    """One command: help heading and text, public function as ``module:name``, and a body that uses its result.
+    """One command: help heading, public function as ``module:name``, and a body that uses its result.
 
-    `body` takes the `Call`, then the command's own options, such as the output. `defaults` are the command's defaults
-    where they differ from the function's. Without a function, `body` takes its own options alone.
+    `body`, whose documentation is the help text, takes the `Call`, then the command's own options, such as the output.
+    `example` are arguments in the help; `defaults` the command's defaults where they differ from the function's.
+    Without a function, `body` takes its own options alone.
     """
 
-    heading: str
-    function: str
     body: Callable[..., None]
-    help: str
+    heading: str
+    function: str = ""
+    example: str = ""
     defaults: Mapping[str, Any] = field(default_factory=dict)
 
     def callback(self, name: str) -> Callable[..., None]:
@@ -233,6 +234,19 @@ class Command:
         return _decorated(name, run, [*listed, *own[1:]])
 
 
+class Commands(dict[str, Command]):
+    """Commands by their names, in the order of the help."""
+
+    def add(self, *row: Any, name: str = "", **more: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+        """Return a decorator that adds a body, by default under its own name; the rest are fields of `Command`."""
+
+        def adding(body: Callable[..., None]) -> Callable[..., None]:
+            self[name or body.__name__.strip("_").replace("_", "-")] = Command(body, *row, **more)
+            return body
+
+        return adding
+
+
 def _decorated(name: str, run: Callable[..., None], listed: list[inspect.Parameter]) -> Callable[..., None]:
     """Return a function for Typer that keeps other files and can be silent."""
     listed = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in listed]
@@ -244,9 +258,10 @@ def _decorated(name: str, run: Callable[..., None], listed: list[inspect.Paramet
 class LazyCommand(TyperCommand):
     """A command of a table, whose options are made when they are needed."""
 
-    def __init__(self, name: str, row: Command, example: str | None = None) -> None:
+    def __init__(self, name: str, row: Command) -> None:
         self._row, self._made = row, None  # type: tuple[Command, Any]
-        text = inspect.cleandoc(row.help) + (f"\n\nExample: mitransient-lidar {name} {example}" if example else "")
+        text = inspect.cleandoc(row.body.__doc__ or "")
+        text += f"\n\nExample: mitransient-lidar {name} {row.example}" if row.example else ""
         super().__init__(name, help=text, rich_help_panel=row.heading, rich_markup_mode=None)
 
     def _full(self) -> Any:

@@ -17,7 +17,7 @@ from mitransient_lidar.cli.files import (
     scene_of,
     write_netcdf,
 )
-from mitransient_lidar.cli.generator import OUTPUT, Call, Command, Quiet, function_at
+from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, Quiet, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted, summarise
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.interruption import DeferredInterrupt
@@ -25,9 +25,12 @@ from mitransient_lidar.core.interruption import DeferredInterrupt
 if TYPE_CHECKING:
     import xarray as xr
 
+COMMANDS = Commands()
+
 Folder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the files; created if missing.")]
 
 
+@COMMANDS.add("Render", "rendering.render:render", "table1 -D wind_speed=5 --target-error 0.05")
 def _render(
     call: Call,
     output: Folder = OUTPUT,
@@ -37,7 +40,14 @@ def _render(
     html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render a scene, and write and draw its result."""
+    """Render the waveforms and gates of a scene.
+
+    Writes DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and prints the paths. A scene with
+    gates gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short. Light by
+    origin and derivatives are in the .nc file, and drawn in _components.png and _derivatives.png; batches of passes
+    are in the .nc file. The files appear together or not at all. Ctrl-C, SIGTERM and SIGHUP keep the completed
+    passes, from the second one on.
+    """
     scene = call.arguments["scene"]
     name, text, _ = scene_of(scene, "render")
     # Checked before the render: films with gates have the parameter gate_count.
@@ -94,55 +104,12 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
         typer.echo(f"no {dispensable}: {error}", err=True)
 
 
-def _frames(
-    call: Call,
-    output: Folder = OUTPUT,
-    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the mean over the frames.")] = True,
-    quiet: Quiet = False,
-) -> None:
-    """Render frames, and write them; the mean over them also as a gate stack."""
-    scene = call.arguments["scene"]
-    name, _, _ = scene_of(scene, "frames")
-    target, gates = output / f"{name}_frames.nc", GateFiles.of(output, f"{name}_frames", drawings=plot)
-    check_targets(output, [target, *gates.names()], scene)
-    with DeferredInterrupt(at_once=False):
-        frames = _again(call)()
-        with announced(output):
-            _write(frames, target)
-            gates.write(frames, None, quiet)
-    exit_if_interrupted(frames)
-
-
-def _passive(
-    call: Call,
-    output: Folder = OUTPUT,
-    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the image, or animate the frames.")] = True,
-    quiet: Quiet = False,
-) -> None:
-    """Render an image, or frames, and write and draw them."""
-    scene, frames = call.arguments["scene"], call.arguments["frames"]
-    name, _, former = scene_of(scene, "passive")
-    is_animation = (frames or len(former.get("frame_passes", [0]))) > 1
-    suffixes = [".nc", ".exr", *([".png"] if plot else []), *([".gif"] if plot and is_animation else [])]
-    targets = [output / f"{name}_passive{suffix}" for suffix in suffixes]
-    check_targets(output, targets, scene)
-    from mitransient_lidar.plots import passive as passive_plots
-    from mitransient_lidar.results import save
-
-    with DeferredInterrupt(at_once=False):
-        image = _again(call)()
-        writers: dict[str, Any] = {".gif": passive_plots.animate_passive, ".png": passive_plots.plot_passive}
-        with announced(output):
-            for target in targets:
-                if target.suffix != ".gif" or "row" in image.dims:
-                    writers.get(target.suffix, save)(image, target)
-    if not quiet:
-        typer.echo(f"mean radiance: {image.attrs['background_radiance']:.4g} W m^-2 sr^-1 nm^-1")
-        if "background_power" in image:
-            typer.echo(f"mean power per pixel: {float(image['background_power'].mean()):.4g} W")
-    exit_if_interrupted(image)
-
-
+@COMMANDS.add(
+    "Render",
+    "rendering.shots.series:render_shots",
+    "table1 --count 20 --passes 4 -o output/shots.nc",
+    defaults={"count": None, "seed": None},
+)
 def _shots(
     call: Call,
     places: Annotated[
@@ -156,7 +123,11 @@ def _shots(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Render a series, and write it."""
+    """Render a series of shots over one sea.
+
+    Writes one file with all waveforms, and the true slope, height and depth at each location, which record, echoes,
+    retrieve and view read. With --figure it also correlates the echoes with the sea's slopes.
+    """
     scene, given = call.arguments["scene"], call.arguments
     if given["positions"] and places is not None:
         raise UserError("--at and --places are alternatives: give one of them")
@@ -197,6 +168,77 @@ def _shots(
     exit_if_interrupted(series)
 
 
+@COMMANDS.add(
+    "Render",
+    "rendering.shots.frames:render_frames",
+    "gated_mine --frames 4 --pulse-rate 100 --pass-share 0.1",
+    defaults={name: None for name in ("pulse_rate_hz", "frames", "gate_order", "readout_s", "speed", "heading_deg")}
+    | {"passes": None},
+)
+def _frames(
+    call: Call,
+    output: Folder = OUTPUT,
+    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the mean over the frames.")] = True,
+    quiet: Quiet = False,
+) -> None:
+    """Render frames of gate images, each with its own pulses.
+
+    Each gate in each frame has its own pulses, between which waves and platform move. Writes
+    DIR/<scene>_frames.nc, and the mean over the frames as <scene>_frames_gates.exr, _gates.png and _depth.png.
+    Ctrl-C keeps the completed frames.
+    """
+    scene = call.arguments["scene"]
+    name, _, _ = scene_of(scene, "frames")
+    target, gates = output / f"{name}_frames.nc", GateFiles.of(output, f"{name}_frames", drawings=plot)
+    check_targets(output, [target, *gates.names()], scene)
+    with DeferredInterrupt(at_once=False):
+        frames = _again(call)()
+        with announced(output):
+            _write(frames, target)
+            gates.write(frames, None, quiet)
+    exit_if_interrupted(frames)
+
+
+@COMMANDS.add(
+    "Render",
+    "rendering.passive:render_passive",
+    "passive_sea --frames 10",
+    defaults={"frames": None, "frame_step_s": None},
+)
+def _passive(
+    call: Call,
+    output: Folder = OUTPUT,
+    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the image, or animate the frames.")] = True,
+    quiet: Quiet = False,
+) -> None:
+    """Render an image by daylight.
+
+    Writes DIR/<scene>_passive.nc, .exr and .png (.gif of frames), and prints the paths. The limits of error, time
+    and passes hold for each frame.
+    """
+    scene, frames = call.arguments["scene"], call.arguments["frames"]
+    name, _, former = scene_of(scene, "passive")
+    is_animation = (frames or len(former.get("frame_passes", [0]))) > 1
+    suffixes = [".nc", ".exr", *([".png"] if plot else []), *([".gif"] if plot and is_animation else [])]
+    targets = [output / f"{name}_passive{suffix}" for suffix in suffixes]
+    check_targets(output, targets, scene)
+    from mitransient_lidar.plots import passive as passive_plots
+    from mitransient_lidar.results import save
+
+    with DeferredInterrupt(at_once=False):
+        image = _again(call)()
+        writers: dict[str, Any] = {".gif": passive_plots.animate_passive, ".png": passive_plots.plot_passive}
+        with announced(output):
+            for target in targets:
+                if target.suffix != ".gif" or "row" in image.dims:
+                    writers.get(target.suffix, save)(image, target)
+    if not quiet:
+        typer.echo(f"mean radiance: {image.attrs['background_radiance']:.4g} W m^-2 sr^-1 nm^-1")
+        if "background_power" in image:
+            typer.echo(f"mean power per pixel: {float(image['background_power'].mean()):.4g} W")
+    exit_if_interrupted(image)
+
+
 def _again(call: Call) -> Call:
     """Return a call without the arguments not given, with the function that renders a result again for a result."""
     from mitransient_lidar.rendering.again import is_result
@@ -209,55 +251,3 @@ def _again(call: Call) -> Call:
     return replace(
         call, function=render_again, arguments={name: one for name, one in given.items() if one is not False}
     )
-
-
-COMMANDS = {
-    "render": Command(
-        "Render",
-        "rendering.render:render",
-        _render,
-        """Render the waveforms and gates of a scene.
-
-        Writes DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and prints the paths. A scene with
-        gates gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short. Light by
-        origin and derivatives are in the .nc file, and drawn in _components.png and _derivatives.png; batches of passes
-        are in the .nc file. The files appear together or not at all. Ctrl-C, SIGTERM and SIGHUP keep the completed
-        passes, from the second one on.
-        """,
-    ),
-    "shots": Command(
-        "Render",
-        "rendering.shots.series:render_shots",
-        _shots,
-        """Render a series of shots over one sea.
-
-        Writes one file with all waveforms, and the true slope, height and depth at each location, which record, echoes,
-        retrieve and view read. With --figure it also correlates the echoes with the sea's slopes.
-        """,
-        defaults={"count": None, "seed": None},
-    ),
-    "frames": Command(
-        "Render",
-        "rendering.shots.frames:render_frames",
-        _frames,
-        """Render frames of gate images, each with its own pulses.
-
-        Each gate in each frame has its own pulses, between which waves and platform move. Writes
-        DIR/<scene>_frames.nc, and the mean over the frames as <scene>_frames_gates.exr, _gates.png and _depth.png.
-        Ctrl-C keeps the completed frames.
-        """,
-        defaults={name: None for name in ("pulse_rate_hz", "frames", "gate_order", "readout_s", "speed", "heading_deg")}
-        | {"passes": None},
-    ),
-    "passive": Command(
-        "Render",
-        "rendering.passive:render_passive",
-        _passive,
-        """Render an image by daylight.
-
-        Writes DIR/<scene>_passive.nc, .exr and .png (.gif of frames), and prints the paths. The limits of error, time
-        and passes hold for each frame.
-        """,
-        defaults={"frames": None, "frame_step_s": None},
-    ),
-}

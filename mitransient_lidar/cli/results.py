@@ -11,7 +11,7 @@ import typer
 from mitransient_lidar.cli.files import PAGE_MB, announced, check_figure, check_suffix, write_page
 from mitransient_lidar.cli.generator import (
     Channel,
-    Command,
+    Commands,
     Define,
     DrawingOnly,
     Lidar,
@@ -26,9 +26,12 @@ from mitransient_lidar.core.errors import UserError
 if TYPE_CHECKING:
     import xarray as xr
 
+COMMANDS = Commands()
+
 _DIFFERENT = 1
 
 
+@COMMANDS.add("Analyse results", "", "output/table1.nc -o waveforms.png")
 def _view(
     file: Annotated[
         Path,
@@ -65,7 +68,16 @@ def _view(
     define: Define = None,
     quiet: Quiet = False,
 ) -> None:
-    """Show a result, a scene or the points of a flight in the browser, or draw a result."""
+    """Show a result, a scene or the points of a flight in the browser, or draw a result's waveforms or layout.
+
+    The page of a scene has sea, bottom, targets, layers, beam and pixels in three dimensions, to scale; that of a
+    flight or LAS file its points by class, with errors of their heights. The page of a result is a map of the
+    pixels at each time, and the waveforms of those that are clicked. Pages need no network. Gates are shown where
+    FILE has them, of frames of a camera their mean. With --plot, --components, --layout or a drawing as --output, a
+    PNG, PDF or SVG file is written instead, by default in FILE's folder. Both print the path. With --layout, the
+    command also prints where the axes of receiver and laser, refracted by a level sea, meet the sea level, targets'
+    depths and the bottom: x, y, z.
+    """
     is_page = output is None or output.suffix.lower() == ".html"
     selection = waveform_selection(file, waveforms, channel, lidar)
     others = {"--plot": plot, "--log": log, "--linear": linear, "--components": components, "--layout": layout}
@@ -163,6 +175,7 @@ def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
     return dataset.sel(shot=number)
 
 
+@COMMANDS.add("Analyse results", "", "one/table1.nc other/table1.nc")
 def _compare(
     first: Annotated[
         Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result, or the record of shots, also LAS or .pls.")
@@ -173,7 +186,10 @@ def _compare(
     channel: Channel = None,
     lidar: Lidar = None,
 ) -> None:
-    """Compare and draw two results."""
+    """Test whether two results agree within their errors.
+
+    Draws both and prints the path; exit code 1 if they differ.
+    """
     from mitransient_lidar import results
     from mitransient_lidar.analysis import comparison
     from mitransient_lidar.plots.waveforms import plot_comparison
@@ -198,31 +214,3 @@ def _compare(
     )
     if not outcome.agrees:
         raise typer.Exit(_DIFFERENT)
-
-
-COMMANDS = {
-    "view": Command(
-        "Analyse results",
-        "",
-        _view,
-        """Show a result, a scene or the points of a flight in the browser, or draw a result's waveforms or layout.
-
-        The page of a scene has sea, bottom, targets, layers, beam and pixels in three dimensions, to scale; that of a
-        flight or LAS file its points by class, with errors of their heights. The page of a result is a map of the
-        pixels at each time, and the waveforms of those that are clicked. Pages need no network. Gates are shown where
-        FILE has them, of frames of a camera their mean. With --plot, --components, --layout or a drawing as --output, a
-        PNG, PDF or SVG file is written instead, by default in FILE's folder. Both print the path. With --layout, the
-        command also prints where the axes of receiver and laser, refracted by a level sea, meet the sea level, targets'
-        depths and the bottom: x, y, z.
-        """,
-    ),
-    "compare": Command(
-        "Analyse results",
-        "",
-        _compare,
-        """Test whether two results agree within their errors.
-
-        Draws both and prints the path; exit code 1 if they differ.
-        """,
-    ),
-}

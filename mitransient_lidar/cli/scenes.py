@@ -8,11 +8,14 @@ from typing import Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import write_page
-from mitransient_lidar.cli.generator import Call, Command
+from mitransient_lidar.cli.files import check_targets, write_page
+from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, Quiet
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables.written import aligned_lines
+
+COMMANDS = Commands()
+SCENES = Commands()
 
 _HEADING = "Scenes and system"
 
@@ -22,6 +25,7 @@ def _print(rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> None:
     typer.echo("\n".join(aligned_lines(rows, right)))
 
 
+@SCENES.add("Commands", name="list")
 def list_scenes() -> None:
     """List the shipped scenes."""
     from mitransient_lidar.loading import catalogue
@@ -29,11 +33,12 @@ def list_scenes() -> None:
     _print((name, catalogue.scene_summary(name)) for name in catalogue.scene_names())
 
 
+@SCENES.add("Commands")
 def _show(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")],
     html: Annotated[bool, typer.Option("--html", help="Write NAME.html, a page of the scene, instead.")] = False,
 ) -> None:
-    """Print the XML of a scene, self-contained, or write its page."""
+    """Print the XML of a scene, self-contained, or write a page that shows it, as view NAME does."""
     if html:
         from mitransient_lidar.plots.viewer import view_scene
 
@@ -46,6 +51,7 @@ def _show(
     typer.echo(scene_text(name), nl=False)
 
 
+@SCENES.add("Commands")
 def _copy(
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="Shipped scene, or file of a guide or flight, e.g. bottoms.toml.")
@@ -53,19 +59,24 @@ def _copy(
     destination: Annotated[Path, typer.Argument(metavar="DEST", help="Folder, or path of the new file.")] = Path("."),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
-    """Copy a scene or an example file to edit, with the data that it names, and print its path."""
+    """Copy a scene or an example file to edit."""
     from mitransient_lidar.loading import catalogue
 
     typer.echo(catalogue.copy_scene(name, destination, overwrite))
 
 
+@SCENES.add("Commands")
 def _instruments(
     name: Annotated[str | None, typer.Argument(metavar="NAME", help="Name of an instrument.")] = None,
     xml: Annotated[
         bool, typer.Option("--xml", help="Print the XML of laser and receiver, to include in a scene.")
     ] = False,
 ) -> None:
-    """List the instruments, or print one instrument's parameters."""
+    """List the instruments, or print the parameters of one with their sources.
+
+    Parameters that are not published are assumed, and listed as such; those of the receiver follow, as the TOML
+    file that record takes. Use with render SCENE --instrument NAME.
+    """
     from mitransient_lidar.loading import instruments as shipped
 
     if name is None:
@@ -83,10 +94,41 @@ def _instruments(
     typer.echo(f"\n{shipped.receiver_text(name)}", nl=False)
 
 
+@COMMANDS.add(_HEADING, "plots.publication.figures:figures", "fig09 fig13")
+def _figures(
+    call: Call,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for figures and table.")] = OUTPUT / "figures",
+    quiet: Quiet = False,
+) -> None:
+    """Make the figures of the published model again.
+
+    Writes a PNG file for each figure, and a table of the publication's statements with computed numbers, their
+    errors, and whether they hold.
+    """
+    from mitransient_lidar.plots.publication import figures as publication
+    from mitransient_lidar.studies.publication.statements import describe_statements
+
+    chosen = publication.check_names(call.arguments["names"])
+    check_targets(output, [output / f"{name}.png" for name in chosen] + [output / publication.TABLE])
+    made = call(names=chosen, output=output)
+    for path in made.files:
+        typer.echo(path)
+    for line in describe_statements(made.statements):
+        typer.echo(line)
+    if made.interrupted:
+        done = max(len(made.files) - 1, 0)
+        raise KeyboardInterrupt(f"interrupted after {done} of {len(chosen)} figures, which are kept")
+
+
+@COMMANDS.add(_HEADING, "", "output/table1.nc")
 def _info(
     file: Annotated[Path | None, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")] = None,
 ) -> None:
-    """Print versions and paths, or the parameters of a result."""
+    """Print versions, the Mitsuba variant and LLVM's path, or a result's parameters.
+
+    A result gives its attributes, then every object in its scene with all parameter values, defaults too. A dash
+    marks parameters that are not given and have no default, or are not used.
+    """
     if file is None:
         from mitransient_lidar.loading import variants
 
@@ -98,43 +140,8 @@ def _info(
     _print((name, str(value)) for name, value in facts.items())
 
 
+@COMMANDS.add(_HEADING, "studies.bench:run", "--quick")
 def _bench(call: Call) -> None:
-    """Run one benchmark."""
+    """Measure the time to a given accuracy."""
     with call.named():
         call.function(**call.arguments)
-
-
-COMMANDS = {
-    "info": Command(
-        _HEADING,
-        "",
-        _info,
-        """Print versions, the Mitsuba variant and LLVM's path, or a result's parameters.
-
-        A result gives its attributes, then every object in its scene with all parameter values, defaults too. A dash
-        marks parameters that are not given and have no default, or are not used.
-        """,
-    ),
-    "bench": Command(_HEADING, "studies.bench:run", _bench, "Measure the time to a given accuracy."),
-}
-
-SCENES = {
-    "list": Command("Commands", "", list_scenes, "List the shipped scenes."),
-    "show": Command(
-        "Commands",
-        "",
-        _show,
-        "Print the XML of a scene, self-contained, or write a page that shows it, as view NAME does.",
-    ),
-    "copy": Command("Commands", "", _copy, "Copy a scene or an example file to edit."),
-    "instruments": Command(
-        "Commands",
-        "",
-        _instruments,
-        """List the instruments, or print the parameters of one with their sources.
-
-        Parameters that are not published are assumed, and listed as such; those of the receiver follow, as the TOML
-        file that record takes. Use with render SCENE --instrument NAME.
-        """,
-    ),
-}

@@ -9,8 +9,10 @@ from typing import Annotated
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
-from mitransient_lidar.cli.generator import OUTPUT, Call, Command, DrawingOnly, Quiet, function_at
+from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, DrawingOnly, Quiet, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted
+
+COMMANDS = Commands()
 
 Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; also writes the data as .nc.")]
 
@@ -20,26 +22,26 @@ _DESIGN, _LIGHT, _SURVEY = "Targets and designs", "Light in water", "Depths and 
 
 def _study(
     heading: str,
-    name: str,
+    function: str,
     plot: str,
     describe: str,
+    example: str,
     text: str,
     *,
-    module: str = "",
-    function: str = "",
+    name: str = "",
     table: str = "",
     table_suffix: str = ".csv",
     has_data: bool = True,
-) -> Command:
-    """Return the command for a study function, which by default shares its name with its module and files.
+) -> None:
+    """Add the command of a study function at ``module:name``, whose files by default have its name, with a help text.
 
-    `plot` is the function in ``plots`` that draws the result, as ``module:name``; `describe` returns its lines; `table`
-    writes another file, with the suffix `table_suffix`.
+    `plot` is the function in ``plots`` that draws the result; `describe`, in the study's module, returns its lines;
+    `table` writes another file, with the suffix `table_suffix`.
     """
-    place = f"studies.{module or name}"
+    module, _, own = function.partition(":")
     suffixes = (".nc",) * has_data + (table_suffix,) * bool(table)
 
-    def body(call: Call, output: Figure = OUTPUT / f"{name}.png", quiet: Quiet = False) -> None:
+    def body(call: Call, output: Figure = OUTPUT / f"{name or own}.png", quiet: Quiet = False) -> None:
         check_figure(output, *suffixes)
         found = call()
         with announced(output.parent):
@@ -47,16 +49,124 @@ def _study(
             if has_data:
                 write_netcdf(found, output.with_suffix(".nc"))
             if table:
-                function_at(f"{place}:{table}")(found, output.with_suffix(table_suffix))
-        typer.echo("\n".join(function_at(f"{place}:{describe}")(found)))
+                function_at(f"{module}:{table}")(found, output.with_suffix(table_suffix))
+        typer.echo("\n".join(function_at(f"{module}:{describe}")(found)))
         for one in getattr(found, "results", [found])[:1]:
             exit_if_interrupted(one)
 
-    return Command(heading, f"{place}:{function or name}", body, text)
+    body.__doc__ = text
+    COMMANDS.add(heading, function, example, name=own.replace("_", "-"))(body)
 
 
+_study(
+    _DESIGN,
+    "studies.shots:find_shots",
+    "studies.shots:plot_found_shots",
+    "describe_found_shots",
+    "table1 --slope-sigmas 1.5",
+    """Find sea locations where the beam meets given slopes.
+
+    Lists and draws locations whose slope faces the lidar or turns away from it, is level, or sideways.
+    """,
+    has_data=False,
+)
+_study(
+    _DESIGN,
+    "studies.target_signal:target_signal",
+    "studies.targets:plot_target_signal",
+    "describe_target",
+    "fig13_2x2 --grid 5",
+    """Measure a target's signal in each pixel.
+
+    Renders the scene with and without the target on the same random numbers, and combines the pixels.
+    """,
+)
+_study(
+    _DESIGN,
+    "studies.detection:detect",
+    "studies.targets:plot_detection",
+    "describe_detection",
+    "fig13_2x2 --receiver pmt --depths 6,8,10",
+    """Compute the detection probability of a target.
+
+    Compares one pixel, the sum and the best combination of pixels.
+    """,
+    name="detection",
+)
+_study(
+    _LIGHT,
+    "studies.light_classes:estimate",
+    "waveforms:plot_components",
+    "describe_estimate",
+    "table1 --instrument riegl_vq840g",
+    """Estimate the waveforms in about a second, over a level sea.
+
+    Looks up the light in maps of the beam: a first look, and a second opinion on a render.
+    """,
+)
+_study(
+    _DESIGN,
+    "studies.bounds:bounds",
+    "studies.parameters:plot_bounds",
+    "describe_bounds",
+    "table1 --free attenuation,bottom_depth --over field_of_view_mrad=10,20,40",
+    """Compute Cramer-Rao bounds of parameters from one shot, and rank designs.
+
+    No unbiased estimate from one shot's record, with the receiver's noise, has a smaller standard deviation.
+    Renders the scene with derivatives by the free parameters, for each combination of values.
+    """,
+    table="write_table",
+)
+_study(
+    _LIGHT,
+    "studies.beam_spread:beam_spread",
+    "studies.light:plot_beam_spread",
+    "describe_spread",
+    "table1 --depths 2,4,8",
+    """Measure how the laser beam spreads with depth.
+
+    Horizontal spread, delays, and share of the light within the field of view.
+    """,
+)
+_study(
+    _LIGHT,
+    "studies.fov_sweep:fov_sweep",
+    "studies.light:plot_fov_sweep",
+    "describe_fov_sweep",
+    "table1 --fov-mrad 5,20,80",
+    "Measure the water's attenuation at several fields of view.",
+)
+_study(
+    _LIGHT,
+    "studies.light_classes:scattering_orders",
+    "studies.light:plot_scattering_orders",
+    "describe_orders",
+    "table1 --orders 4",
+    """Separate the received light by scattering order.
+
+    Each order is also separated by its vertical reversals: one, or several.
+    """,
+)
+_study(
+    _SURVEY,
+    "studies.forecast:forecast",
+    "studies.depths:plot_forecast",
+    "describe_forecast",
+    "riegl_vq840g 1:12 --secchi 6 -D wind_speed=5",
+    """Forecast where an instrument finds the bottom of a site, how well, and down to which depth.
+
+    Computes a table of bottoms under waves, recorded with the receiver's noise, and maps of the site: probability
+    that the bottom is found, TVU and THU at 95 %, IHO S-44 order, and deepest depth. Of a map it also writes a
+    GeoTIFF with these bands.
+    """,
+    table="write_maps",
+    table_suffix=".tif",
+)
+
+
+@COMMANDS.add(_LIGHT, "studies.water_report:describe_water", "jerlov 3C")
 def _water(call: Call, output: DrawingOnly = None) -> None:
-    """Print and draw a water's properties."""
+    """Print the optical properties of a water and its parameters."""
     check_figure(output)
     with announced():
         lines = call()
@@ -65,6 +175,7 @@ def _water(call: Call, output: DrawingOnly = None) -> None:
         typer.echo("\n".join(lines))
 
 
+@COMMANDS.add(_SURVEY, "studies.depth_bias:depth_bias", "riegl_vq840g --winds 0,3 --depths 3,6")
 def _depth_bias(
     call: Call,
     output: Annotated[
@@ -75,7 +186,12 @@ def _depth_bias(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write the table of an instrument, and draw its biases."""
+    """Measure the depth errors in an instrument's records.
+
+    Renders the instrument over known bottoms at each angle, wind, water and depth, and records it with its
+    receiver's noise. Measures the depths, and prints share found, bias, spread and stated error [cm] for the
+    estimator gaussian. The file contains all estimators; echoes --correct reads it.
+    """
     target = output or OUTPUT / f"{call.arguments['instrument']}_depths.nc"
     check_suffix("--output", target, ".nc")
     check_targets(target.parent, [target], call.arguments["scene"])
@@ -90,12 +206,19 @@ def _depth_bias(
     typer.echo("\n".join(describe_depth_bias(found)))
 
 
+@COMMANDS.add(_SURVEY, "studies.depth_bias:tpu", "riegl_vq840g --altitudes 100,150")
 def _tpu(
     call: Call,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the files.")] = OUTPUT,
     quiet: Quiet = False,
 ) -> None:
-    """Write an instrument's uncertainties, with figures and fits for each altitude and angle."""
+    """Determine the vertical and horizontal uncertainty of an instrument's soundings.
+
+    Renders the instrument over known bottoms at each altitude, angle, wind, water and depth. Writes a NetCDF file
+    and figures with the uncertainties of single soundings, measured and corrected, and the IHO S-44 orders that
+    they meet. CSV files for uncertainty tools contain fits of the part below the sea surface. Prints TVU at 95 %
+    [cm] and the fits.
+    """
     from mitransient_lidar.analysis.depth_uncertainty import write_fits
     from mitransient_lidar.loading.instruments import read_instrument
     from mitransient_lidar.plots.studies.depths import plot_orders, plot_uncertainty
@@ -122,134 +245,3 @@ def _tpu(
                     write_fits(one.sel(correction=kind), "vertical", output / f"{stem}_tvu{suffix}.csv")
                 write_fits(one, "horizontal", output / f"{stem}_thu.csv")
     typer.echo("\n".join(describe_tpu(found)))
-
-
-STUDIES = {
-    "find-shots": _study(
-        _DESIGN,
-        "find_shots",
-        "studies.shots:plot_found_shots",
-        "describe_found_shots",
-        """Find sea locations where the beam meets given slopes.
-
-        Lists and draws locations whose slope faces the lidar or turns away from it, is level, or sideways.
-        """,
-        module="shots",
-        has_data=False,
-    ),
-    "target-signal": _study(
-        _DESIGN,
-        "target_signal",
-        "studies.targets:plot_target_signal",
-        "describe_target",
-        """Measure a target's signal in each pixel.
-
-        Renders the scene with and without the target on the same random numbers, and combines the pixels.
-        """,
-    ),
-    "detect": _study(
-        _DESIGN,
-        "detection",
-        "studies.targets:plot_detection",
-        "describe_detection",
-        """Compute the detection probability of a target.
-
-        Compares one pixel, the sum and the best combination of pixels.
-        """,
-        function="detect",
-    ),
-    "estimate": _study(
-        _LIGHT,
-        "estimate",
-        "waveforms:plot_components",
-        "describe_estimate",
-        """Estimate the waveforms in about a second, over a level sea.
-
-        Looks up the light in maps of the beam: a first look, and a second opinion on a render.
-        """,
-        module="light_classes",
-    ),
-    "bounds": _study(
-        _DESIGN,
-        "bounds",
-        "studies.parameters:plot_bounds",
-        "describe_bounds",
-        """Compute Cramer-Rao bounds of parameters from one shot, and rank designs.
-
-        No unbiased estimate from one shot's record, with the receiver's noise, has a smaller standard deviation.
-        Renders the scene with derivatives by the free parameters, for each combination of values.
-        """,
-        table="write_table",
-    ),
-    "beam-spread": _study(
-        _LIGHT,
-        "beam_spread",
-        "studies.light:plot_beam_spread",
-        "describe_spread",
-        """Measure how the laser beam spreads with depth.
-
-        Horizontal spread, delays, and share of the light within the field of view.
-        """,
-    ),
-    "fov-sweep": _study(
-        _LIGHT,
-        "fov_sweep",
-        "studies.light:plot_fov_sweep",
-        "describe_fov_sweep",
-        "Measure the water's attenuation at several fields of view.",
-    ),
-    "scattering-orders": _study(
-        _LIGHT,
-        "scattering_orders",
-        "studies.light:plot_scattering_orders",
-        "describe_orders",
-        """Separate the received light by scattering order.
-
-        Each order is also separated by its vertical reversals: one, or several.
-        """,
-        module="light_classes",
-    ),
-    "forecast": _study(
-        _SURVEY,
-        "forecast",
-        "studies.depths:plot_forecast",
-        "describe_forecast",
-        """Forecast where an instrument finds the bottom of a site, how well, and down to which depth.
-
-        Computes a table of bottoms under waves, recorded with the receiver's noise, and maps of the site: probability
-        that the bottom is found, TVU and THU at 95 %, IHO S-44 order, and deepest depth. Of a map it also writes a
-        GeoTIFF with these bands.
-        """,
-        table="write_maps",
-        table_suffix=".tif",
-    ),
-    "water": Command(
-        _LIGHT,
-        "studies.water_report:describe_water",
-        _water,
-        "Print the optical properties of a water and its parameters.",
-    ),
-    "depth-bias": Command(
-        _SURVEY,
-        "studies.depth_bias:depth_bias",
-        _depth_bias,
-        """Measure the depth errors in an instrument's records.
-
-        Renders the instrument over known bottoms at each angle, wind, water and depth, and records it with its
-        receiver's noise. Measures the depths, and prints share found, bias, spread and stated error [cm] for the
-        estimator gaussian. The file contains all estimators; echoes --correct reads it.
-        """,
-    ),
-    "tpu": Command(
-        _SURVEY,
-        "studies.depth_bias:tpu",
-        _tpu,
-        """Determine the vertical and horizontal uncertainty of an instrument's soundings.
-
-        Renders the instrument over known bottoms at each altitude, angle, wind, water and depth. Writes a NetCDF file
-        and figures with the uncertainties of single soundings, measured and corrected, and the IHO S-44 orders that
-        they meet. CSV files for uncertainty tools contain fits of the part below the sea surface. Prints TVU at 95 %
-        [cm] and the fits.
-        """,
-    ),
-}

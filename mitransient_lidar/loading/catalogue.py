@@ -82,14 +82,8 @@ def copy_scene(
     Raises UserError if there is no such scene, a file exists already, or one cannot be read or written. No file is
     written then.
 
-    Parameters
-    ----------
-    name : str or path
-        As in `scene_path`, or the name of a file in `example_files`.
-    destination : path
-        Folder, or path of the new file, which is returned.
-    overwrite : bool
-        Whether to replace files.
+    `name`: as in `scene_path`, or the name of a file in `example_files`. `destination`: folder, or path of the new
+    file, which is returned. `overwrite`: whether to replace files.
     """
     source = example_files().get(str(name)) or scene_path(name)
     destination = Path(destination)

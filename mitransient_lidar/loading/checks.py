@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError, printable
@@ -123,8 +124,6 @@ def check_libraries(*folders: Path) -> None:
     Mitsuba loads plugins from there, its own ones last: beside a scene, or in the current folder, they would run the
     scene author's code.
     """
-    import mitsuba as mi
-
     own = Path(mi.__file__).parent.resolve()
     for folder in (*folders, Path(), *(Path(str(path)) for path in mi.file_resolver())):
         place = folder.resolve() / "plugins"

@@ -11,10 +11,13 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+import drjit.scalar as ds
+import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.transport.plugin_types import LidarSensor, Transmitter
 
 #: Distance from the scene's origin to the aim up to which the scene's own frame is used [m].
 _NEAR = 250.0
@@ -48,8 +51,6 @@ def move_to_aim(parsed: Any) -> None:
     A scene with loaded objects, with plugins whose locations are unknown, or with a texture on an ``ocean_surface``, or
     on a seabed and another shape, stays unmoved.
     """
-    import mitsuba as mi
-
     from mitransient_lidar.plugins.bases import FRAME_ORIGIN
 
     nodes = list(parsed.nodes)
@@ -78,8 +79,6 @@ def move_to_aim(parsed: Any) -> None:
 
 def frame_origin(scene: Any) -> FloatArray:
     """Return the place of the frame's origin in a loaded scene [m], shape (3,)."""
-    from mitransient_lidar.transport.plugin_types import LidarSensor, Transmitter
-
     poses = [emitter.pose for emitter in scene.emitters() if isinstance(emitter, Transmitter)]
     poses += [sensor.receiver.pose for sensor in scene.sensors() if isinstance(sensor, LidarSensor)]
     return poses[0].frame_origin if poses else np.zeros(3)
@@ -106,8 +105,6 @@ def _aim(nodes: list[Any]) -> tuple[float, float] | None:
 
 def _is_movable(node: Any) -> bool:
     """Return whether a node's location is known."""
-    import mitsuba as mi
-
     kinds = mi.ObjectType.Shape, mi.ObjectType.Sensor, mi.ObjectType.Emitter, mi.ObjectType.Medium, mi.ObjectType.Volume
     if node.type in kinds and _name(node) not in (*_OWN, *_PLACED, *_WITHOUT_PLACE):
         return False
@@ -122,9 +119,6 @@ def _is_movable(node: Any) -> bool:
 
 def _placement(node: Any) -> Any:
     """Return the transform of a Mitsuba node to the scene, whose points are then relative to the first of them."""
-    import drjit.scalar as ds
-    import mitsuba as mi
-
     props, placement = node.props, _transform(node, "to_world")
     points = _POINTS.get(_name(node), ())
     if not points or any(name not in props or props.type(name) != mi.Properties.Type.Vector for name in points):
@@ -137,8 +131,6 @@ def _placement(node: Any) -> Any:
 
 def _transform(node: Any, name: str) -> Any:
     """Return a transform of a node, by default the identity."""
-    import mitsuba as mi
-
     return node.props[name] if name in node.props else mi.ScalarAffineTransform4d()
 
 
@@ -165,8 +157,6 @@ def _textures(nodes: list[Any], node: Any) -> set[int]:
 
 def _children(node: Any) -> Iterator[int]:
     """Return the numbers of the nodes that a node refers to."""
-    import mitsuba as mi
-
     props = node.props
     for name in props:
         if props.type(name) == mi.Properties.Type.ResolvedReference:

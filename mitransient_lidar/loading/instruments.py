@@ -29,6 +29,7 @@ from mitransient_lidar.loading.document import (
     text_of,
 )
 from mitransient_lidar.loading.parameters import plugins_of, values_of, without_replaced
+from mitransient_lidar.transport.sensor.pixels import LayoutPixels
 
 #: End of the name of an instrument's infrared channel, beginning of the names of its parameters, and those of both.
 _INFRARED, _OF_INFRARED, _OF_BOTH = "_infrared", "infrared.", ("altitude", "aim_x", "aim_y")
@@ -80,8 +81,6 @@ def read_instrument(name: str) -> Instrument:
     pixels = [tag for tag in root.getElementsByTagName("sensor") if tag.getAttribute("type") == "pixel_fov"]
     names = [tag.getAttribute("value") for pixel in pixels for tag in _named(pixel, "pixel_name")]
     if not names:
-        from mitransient_lidar.transport.sensor.pixels import LayoutPixels
-
         layout = next(parameter.value for parameter in parameters if parameter.name == "layout")
         names = LayoutPixels(layout, 1e-3, "circle").names
     return Instrument(

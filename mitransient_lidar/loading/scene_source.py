@@ -33,8 +33,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import drjit as dr
+import drjit.scalar as ds
+import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError, printable
@@ -54,9 +57,7 @@ from mitransient_lidar.loading.checks import (
 from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
 from mitransient_lidar.loading.frame import frame_origin
 from mitransient_lidar.loading.parameters import values_of
-
-if TYPE_CHECKING:
-    import mitsuba as mi
+from mitransient_lidar.transport.plugin_types import OwnPlugin
 
 #: Largest image, volume or tensor that is stored, compressed and in memory [bytes].
 _MOST_STORED, _MOST_IN_MEMORY = 2**20, 2**26
@@ -64,8 +65,6 @@ _MOST_STORED, _MOST_IN_MEMORY = 2**20, 2**26
 
 def to_json(value: Any) -> Any:
     """Return a dict scene's value in JSON types; raise TypeError for an unknown one."""
-    import mitsuba as mi
-
     if isinstance(value, Mapping):
         return {key: to_json(item) for key, item in value.items()}
     if isinstance(value, (bool, int, float, str)):
@@ -95,9 +94,6 @@ def from_json(value: Any) -> Any:
     if isinstance(value.get("stored"), str):
         return _restored(value)
     if set(value) == {"matrix", "inverse_transpose"}:
-        import drjit.scalar as ds
-        import mitsuba as mi
-
         of_texture = len(value["matrix"]) == 3
         kind, matrix = (mi.ScalarTransform3d, ds.Matrix3f64) if of_texture else (mi.ScalarTransform4d, ds.Matrix4f64)
         return kind(*(matrix(value[name]) for name in ("matrix", "inverse_transpose")))
@@ -106,8 +102,6 @@ def from_json(value: Any) -> Any:
 
 def _stored(value: Any) -> dict[str, Any]:
     """Return an image, a volume or a tensor; raise TypeError if it is too large to be stored, or is not restored."""
-    import mitsuba as mi
-
     array = np.array(value)
     data = zlib.compress(array.tobytes())
     if array.nbytes > _MOST_IN_MEMORY or len(data) > _MOST_STORED:
@@ -123,8 +117,6 @@ def _stored(value: Any) -> dict[str, Any]:
 
 def _file_of(volume: mi.VolumeGrid) -> bytes:
     """Return the bytes of a volume's file."""
-    import mitsuba as mi
-
     stream = mi.MemoryStream()
     volume.write(stream)
     return bytes(stream.raw_buffer())
@@ -132,8 +124,6 @@ def _file_of(volume: mi.VolumeGrid) -> bytes:
 
 def _restored(value: Mapping[str, Any]) -> Any:
     """Return the image, volume or tensor from `_stored`."""
-    import mitsuba as mi
-
     raw = zlib.decompressobj().decompress(base64.b64decode(value["data"], validate=True), _MOST_IN_MEMORY)
     array = np.frombuffer(raw, value["dtype"]).reshape(value["shape"])
     if value["stored"] == "VolumeGrid":
@@ -331,11 +321,7 @@ def object_values(part: mi.Object, origin: FloatArray = _ORIGIN, used: Used = ()
 
     `origin` is the frame's origin in the scene [m]: positions are scene coordinates.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     from mitransient_lidar.plugins.bases import exposed
-    from mitransient_lidar.transport.plugin_types import OwnPlugin
 
     if not isinstance(part, OwnPlugin):
         values, objects = exposed(part)
@@ -405,8 +391,6 @@ def _found(references: Iterator[tuple[str, str]], folders: Sequence[Path]) -> di
     Files for Mitsuba's plugins are first looked for in the scene's folders and in Mitsuba's file resolver. Raises
     UserError if a file is no regular one, has control characters in its name, or is a damaged mesh.
     """
-    import mitsuba as mi
-
     files = {}
     searched = [*folders, *(Path(str(place)) for place in mi.file_resolver()), Path()]
     for plugin, name in references:

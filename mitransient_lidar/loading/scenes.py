@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import Any, Literal, overload
+
+import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.validation import shown
@@ -23,15 +25,12 @@ from mitransient_lidar.loading.frame import move_to_aim
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_params, fill, unknown_parameters, values_of
 from mitransient_lidar.loading.scene_source import SceneSource, plugin_values
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.height_maps import IN_MAP_COORDINATES
-
-if TYPE_CHECKING:
-    import mitsuba as mi
-
-    from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.transport.daylight.renderer import DaylightIntegrator
-    from mitransient_lidar.transport.paths.passes import LidarIntegrator
-    from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.daylight.renderer import DaylightIntegrator
+from mitransient_lidar.transport.paths.passes import LidarIntegrator
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import fit_seas, lidar_sensor
 
 logger = logging.getLogger(__name__)
 
@@ -52,8 +51,6 @@ class LoadedScene:
     @cached_property
     def sensor(self) -> mi.Sensor:
         """The receiver; raise UserError if the scene has none, or none of that id."""
-        from mitransient_lidar.transport.scene_parts import lidar_sensor
-
         return lidar_sensor(self.scene, self.sensor_id or (self.source.sensor if self.source else ""))
 
     def attributes(
@@ -124,10 +121,7 @@ def open_scene(
     if isinstance(scene, LoadedScene) and not params and not sensor:
         return scene
     variants.set_variant(variant)
-    import mitsuba as mi
     import xarray as xr
-
-    from mitransient_lidar.transport.scene_parts import fit_seas, lidar_sensor
 
     check_params(params)
     is_dict = isinstance(scene, Mapping) and not isinstance(scene, xr.Dataset)
@@ -163,10 +157,6 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
 
     Raises UserError if it is not a lidar integrator, or for `passive`, not one for daylight.
     """
-    import mitsuba as mi
-
-    from mitransient_lidar.transport.paths.passes import LidarIntegrator
-
     own = scene.integrator()
     if wanted is None and passive and not (isinstance(own, LidarIntegrator) and own.passive):
         wanted = "passive_volpath"
@@ -258,8 +248,6 @@ def _filled(document: SceneDocument, params: Mapping[str, Any] | None) -> SceneD
 
 def _load_dict(scene: Mapping[str, Any] | SceneSource) -> LoadedScene:
     """Load a scene given as a dict, or its source."""
-    import mitsuba as mi
-
     given = scene.scene_dict() if isinstance(scene, SceneSource) else scene
     check_dict(given)
     # A source's files are the files in the scene, too, not the files in its list.
@@ -273,7 +261,6 @@ def _load_dict(scene: Mapping[str, Any] | SceneSource) -> LoadedScene:
 
 def _with_own_tensors(part: Mapping[str, Any]) -> dict[str, Any]:
     """Return a dict with copies of its tensors: Mitsuba empties tensors that become textures."""
-    import mitsuba as mi
 
     def own(value: Any) -> Any:
         if isinstance(value, Mapping):
@@ -287,8 +274,6 @@ def _load_xml(
     scene: SceneSource | str | os.PathLike[str], params: Mapping[str, Any] | None, instrument: str | None
 ) -> LoadedScene:
     """Load an XML scene by the steps in `loading.document`."""
-    import mitsuba as mi
-
     document = _filled(_document(scene, instrument), params)
     source = SceneSource.of_document(document, scene if isinstance(scene, SceneSource) else None)
     text = source.place_files(document)
@@ -299,8 +284,6 @@ def _load_xml(
 
 def _instantiate(parse: Callable[[Any], Any]) -> Any:
     """Return the object of a scene that a function parses, with seas whose meshes wait for `fit_seas`."""
-    import mitsuba as mi
-
     from mitransient_lidar.plugins.ocean_surface import WAITS
 
     config = mi.parser.ParserConfig(mi.variant())
@@ -329,8 +312,6 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
 @contextlib.contextmanager
 def _own_file_resolver(folder: Path | None = None) -> Iterator[None]:
     """Add a folder to Mitsuba's search path for files; remove it, and the ``<path>`` folders, afterwards."""
-    import mitsuba as mi
-
     resolver = mi.file_resolver()
     former = [str(path) for path in resolver]
     if folder is not None:

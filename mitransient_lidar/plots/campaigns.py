@@ -44,14 +44,8 @@ def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, see
 
     Raises UserError if no run is done, or the file name has another suffix.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A campaign as from `campaigns.store.open_campaign`.
-    path : path-like, optional
-        PNG, PDF or SVG file to write.
-    seed : int
-        Sample seed.
+    `dataset`: a campaign as from `campaigns.store.open_campaign`. `path`: PNG, PDF or SVG file to write. `seed`: sample
+    seed.
     """
     figure = drawing.new_figure(path, 11.0, 9.6)
     done = np.flatnonzero(dataset["status"].values == _DONE)

@@ -23,14 +23,8 @@ _ANIMATION_WIDTH = 384
 def plot_passive(dataset: xr.Dataset, path: drawing.FilePath | None = None, frame: int = 0) -> Figure:
     """Draw an image in grey, with the far edge on top; pixels without a grid as bars of their radiance.
 
-    Parameters
-    ----------
-    dataset
-        A result of `mitransient_lidar.rendering.passive.render_passive`.
-    path : path, optional
-        File to write.
-    frame
-        Frame index, if there are several.
+    `dataset`: a result of `mitransient_lidar.rendering.passive.render_passive`. `path`: file to write. `frame`: frame
+    index, if there are several.
     """
     figure = drawing.new_figure(path, 6.4, 5.6)
     picture = dataset

@@ -44,14 +44,7 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
 
     Returns the files.
 
-    Parameters
-    ----------
-    flown
-        The pulses.
-    points
-        Their points, as from `flights.products.points_of`.
-    folder
-        Folder for the files.
+    `flown`: the pulses. `points`: their points, as from `flights.products.points_of`. `folder`: folder for the files.
     """
     paths = [folder / "flight.png", folder / "profile.png"]
     figure = drawing.new_figure(paths[0], 11, 8.5)

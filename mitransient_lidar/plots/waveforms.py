@@ -35,15 +35,9 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
     receiver's axis for several. Pixels are drawn in the shapes of their outlines, or as dots without them. The depth
     axis is left out if the result lacks its attributes.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A result in the form of `mitransient_lidar.results.dataset`, or a record from
-        `analysis.receiver.detect_waveforms`; one shot or several.
-    path : path, optional
-        File to write.
-    scale : {'both', 'linear', 'log'}
-        Power axis scale; 'both' draws two panels.
+    `dataset`: a result in the form of `mitransient_lidar.results.dataset`, or a record from
+    `analysis.receiver.detect_waveforms`; one shot or several. `path`: file to write. `scale`: power axis scale; 'both'
+    draws two panels.
     """
     if scale not in get_args(Scale):
         raise UserError(f"scale = {scale!r} must be one of {', '.join(get_args(Scale))}")

@@ -22,16 +22,15 @@ from mitransient_lidar.rendering.accuracy import (
     received_power,
     smoothing_bias,
 )
+from mitransient_lidar.rendering.derivatives import Differences, Parameter
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
 from mitransient_lidar.results.sum_errors import with_correlation
+from mitransient_lidar.transport.paths.histogram import GateWeights, TransientHistogram
+from mitransient_lidar.transport.scene import LidarScene
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from mitransient_lidar.rendering.derivatives import Differences, Parameter
-    from mitransient_lidar.transport.paths.histogram import GateWeights, TransientHistogram
-    from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
 
@@ -146,8 +145,6 @@ class PassAccumulator:
             return
         pulse, response = scene.transmitter.pulse, scene.receiver.optics.response_time_ns
         if kept == "direct" or self.gates_beside:
-            from mitransient_lidar.transport.paths.histogram import GateWeights
-
             self.gate_weights = GateWeights(train, train.response_weights(pulse, response), scene.reference_length)
         else:
             # Bin weights in gates, shape (bin, gate).
@@ -330,8 +327,6 @@ def choose_accumulator(
     Raises UserError if images without rows, columns or gates would be smoothed, a histogram without gates or a single
     gate exceeds the memory, or gates by depth have no surface.
     """
-    from mitransient_lidar.transport.paths.histogram import TransientHistogram
-
     pixels, per_bin = scene.receiver.pixels.count, TransientHistogram.BYTES_PER_BIN
     each, limit = pixels * scene.axis.bin_count, 1e9 * max_memory
     channels = 1 + len(parameters)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +13,8 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.lidar.axis_limits import COLUMN_LEVEL
 from mitransient_lidar.physics.lidar.pulse import waveform
-
-if TYPE_CHECKING:
-    from mitransient_lidar.transport.probe import Probe
-    from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.probe import Probe
+from mitransient_lidar.transport.scene import LidarScene
 
 #: Pixels darker than this fraction of the median are excluded from the radiance errors.
 _DARK_PIXEL = 1e-2

@@ -7,8 +7,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import TYPE_CHECKING
 
+import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.constants import C0
@@ -20,15 +20,11 @@ from mitransient_lidar.loading.parameters import parameter_of, value_of, with_va
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.rendering.accuracy import LightStatistics, PassStatistics, received_power
+from mitransient_lidar.transport.paths.passes import LidarIntegrator, PassRenderer
 from mitransient_lidar.transport.paths.water_changes import coefficient_derivative, mean_cosine_derivative
 from mitransient_lidar.transport.perturbations import Perturbation
-
-if TYPE_CHECKING:
-    import mitsuba as mi
-
-    from mitransient_lidar.transport.paths.passes import LidarIntegrator, PassRenderer
-    from mitransient_lidar.transport.plugin_types import SeaShape
-    from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.plugin_types import SeabedShape, SeaShape
+from mitransient_lidar.transport.scene import LidarScene
 
 #: Largest number of parameters in a render.
 MOST_PARAMETERS = 64
@@ -179,10 +175,6 @@ def _reflectance(name: str, solid: mi.Shape) -> Parameter:
 
 def _uniform_reflectance(solid: mi.Shape) -> float | None:
     """Return the reflectance of a diffuse solid, None for others."""
-    import mitsuba as mi
-
-    from mitransient_lidar.transport.plugin_types import SeabedShape
-
     if solid.class_name() == "Instance":
         return None
     kept = mi.traverse(solid.bsdf())

@@ -36,16 +36,8 @@ def fit_to_time(
     paths measures the kernel time. If two full passes would exceed the limit, the number of paths is halved until four
     passes fit, or the work besides the kernels takes longer.
 
-    Parameters
-    ----------
-    renderer
-        Renderer for full passes.
-    max_time
-        Time limit for the render [s].
-    start_ns
-        Time at which light enters the water [ns].
-    seed, gates
-        Arguments of `PassRenderer.render_pass` for the first pass.
+    `renderer`: renderer for full passes. `max_time`: time limit for the render [s]. `start_ns`: time at which light
+    enters the water [ns]. `seed`, `gates`: arguments of `PassRenderer.render_pass` for the first pass.
 
     Returns
     -------

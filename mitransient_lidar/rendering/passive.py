@@ -7,7 +7,7 @@ import logging
 import os
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -38,10 +38,8 @@ from mitransient_lidar.rendering.passes import (
     warn_of_edge_loss,
 )
 from mitransient_lidar.results.attributes import label, titled
-
-if TYPE_CHECKING:
-    from mitransient_lidar.transport.daylight.renderer import DaylightRenderer
-    from mitransient_lidar.transport.sensor.pixels import PixelArray
+from mitransient_lidar.transport.daylight.renderer import DaylightRenderer, pixel_solid_angles, share_outside_surface
+from mitransient_lidar.transport.sensor.pixels import PixelArray
 
 logger = logging.getLogger(__name__)
 
@@ -305,8 +303,6 @@ def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[
 
 def _etendue(renderer: DaylightRenderer) -> FloatArray:
     """Return open area times solid angle times transmittance of optics and air, one way [m^2 sr], shape (pixels,)."""
-    from mitransient_lidar.transport.daylight.renderer import pixel_solid_angles
-
     receiver = renderer.scene.receiver
     optics = receiver.optics
     one_way = float(np.sqrt(optics.two_way_atmospheric_transmittance))
@@ -316,8 +312,6 @@ def _etendue(renderer: DaylightRenderer) -> FloatArray:
 
 def _describe(renderer: DaylightRenderer) -> dict[str, Any]:
     """Return the attributes of receiver and daylight; warn about a field of view beyond the surface."""
-    from mitransient_lidar.transport.daylight.renderer import share_outside_surface
-
     scene, receiver = renderer.scene, renderer.scene.receiver
     outside = share_outside_surface(scene, renderer.sampler)
     if outside > TOLERATED_LOSS:

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import mitsuba as mi
+
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Infrared, Instrument, Option, SceneOrResult, Sensor, checked
@@ -16,6 +18,9 @@ from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, ope
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator, share_of_pass
 from mitransient_lidar.rendering.accuracy import ErrorWindow
+from mitransient_lidar.rendering.derivatives import Differences, path_parameters, perturbations
+from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
+from mitransient_lidar.rendering.pass_size import describe_cost, fit_to_time
 from mitransient_lidar.rendering.passes import (
     DEFAULT_MAX_MEMORY_GB,
     TOLERATED_LOSS,
@@ -36,13 +41,16 @@ from mitransient_lidar.rendering.passes import (
     run_passes,
     warn_of_edge_loss,
 )
+from mitransient_lidar.rendering.passive import render_passive
+from mitransient_lidar.rendering.scene_checks import check_scene
+from mitransient_lidar.rendering.shots.frames import render_frames
+from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.attributes import join, split
+from mitransient_lidar.transport.paths.passes import check_solids
+from mitransient_lidar.transport.scene import LidarScene
 
 if TYPE_CHECKING:
-    import mitsuba as mi
     import xarray
-
-    from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
 
@@ -196,10 +204,6 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     """
     import xarray
 
-    from mitransient_lidar.rendering.passive import render_passive
-    from mitransient_lidar.rendering.shots.frames import render_frames
-    from mitransient_lidar.rendering.shots.series import render_shots
-
     functions: dict[str, Callable[..., xarray.Dataset]] = {
         "render": render,
         "passive": render_passive,
@@ -222,8 +226,6 @@ def _render(
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
     max_memory = options.max_memory or DEFAULT_MAX_MEMORY_GB
-    from mitransient_lidar.transport.paths.passes import check_solids
-
     if components:
         check_solids(sum(not shape.is_medium_transition() for shape in session.scene.shapes()))
     sensor, chosen = session.sensor, choose_integrator(session.scene, integrator)
@@ -231,18 +233,12 @@ def _render(
     if components:
         renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
-    from mitransient_lidar.rendering.derivatives import Differences, path_parameters, perturbations
-
     parameters = path_parameters(renderer, options.derivatives or [], others=session.parameters)
     moved = [one.name for one in parameters if one.perturbation is None]
     differences = Differences(session, chosen, moved, renderer=renderer) if moved else None
     session.tell_axis(lidar.axis, lidar.record_end)
     if changes := perturbations(parameters):
         renderer = renderer.perturbed(changes)
-    from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
-    from mitransient_lidar.rendering.pass_size import describe_cost, fit_to_time
-    from mitransient_lidar.rendering.scene_checks import check_scene
-
     window = ErrorWindow.of_probe(renderer.probe)
     check_scene(renderer.probe)
     described = describe_scene(renderer.probe, window, renderer.focusing)

@@ -115,16 +115,10 @@ def add_derivatives(
 ) -> xr.Dataset:
     """Return a result from `build` or `build_series` with its derivatives by parameters.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        The result.
-    names, values, units, methods : sequences
-        For each parameter: unique name, value at which the light was rendered, unit, and ``score`` or ``central
-        differences``.
-    arrays : array-like of shape (parameter, pixel, time)
-        Derivatives of the four arrays of `build` by the parameter in its unit; in a series with the shots after the
-        parameters.
+    `dataset`: the result. `names`, `values`, `units`, `methods`: for each parameter: unique name, value at which the
+    light was rendered, unit, and ``score`` or ``central differences``. `arrays`: derivatives of the four arrays of
+    `build` by the parameter in its unit; in a series with the shots after the parameters, shape (parameter, pixel,
+    time).
     """
     coords = {
         "parameter": np.array(names, dtype=str),

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
@@ -18,10 +19,10 @@ from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes
 from mitransient_lidar.results.attributes import label
-
-if TYPE_CHECKING:
-    from mitransient_lidar.transport.plane_crossings import PlaneCrossings
-    from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.medium.water_phases import table_of
+from mitransient_lidar.transport.plane_crossings import CrossingTracer, PlaneCrossings
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 logger = logging.getLogger(__name__)
 
@@ -96,9 +97,6 @@ def beam_spread(
     """
     wanted = np.unique(depths)
     session = open_scene(scene, params, instrument)
-    from mitransient_lidar.transport.plane_crossings import CrossingTracer
-    from mitransient_lidar.transport.scene_parts import find_lidar_scene
-
     lidar = find_lidar_scene(session.scene, session.sensor)
     lidar.transmitter.pose.require_above_sea()
     planes = _planes(lidar, wanted)
@@ -193,8 +191,6 @@ def _measure(lidar: LidarScene, light: PlaneCrossings, depth: float, axes: dict[
 
 def _in_view(lidar: LidarScene, light: PlaneCrossings, depth: float) -> npt.NDArray[np.bool_]:
     """Return whether the line of sight from the receiver to the light through a level sea is in a pixel."""
-    import mitsuba as mi
-
     pose, pixels = lidar.receiver.pose, lidar.receiver.pixels
     points = np.stack([light.x, light.y, np.full_like(light.x, -depth)], axis=1)
     seen = np.pad(LevelSea((lidar.refractive_index,)).crossing(pose.origin, points), ((0, 0), (0, 1))) - pose.origin
@@ -205,8 +201,6 @@ def _in_view(lidar: LidarScene, light: PlaneCrossings, depth: float) -> npt.NDAr
 
 def _describe(lidar: LidarScene) -> dict[str, Any]:
     """Return the attributes of lidar and water."""
-    from mitransient_lidar.transport.medium.water_phases import table_of
-
     water: Any = lidar.water
     column, boundaries = water.column, water.index_layers.boundaries
     first = 0.0 if water.plume is not None else np.inf

@@ -17,17 +17,23 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
+from mitransient_lidar.loading.catalogue import scene_text
 from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.instruments import instrument_names
+from mitransient_lidar.loading.scenes import choose_integrator, open_scene
+from mitransient_lidar.rendering.render import render
+from mitransient_lidar.transport.paths.passes import PassRenderer
+from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.scene_parts import lidar_sensor
 
 if TYPE_CHECKING:
-    import mitsuba as mi
     import xarray as xr
-
-    from mitransient_lidar.transport.paths.passes import PassRenderer
 
 #: Measurement values: task labels and arguments.
 Tasks = Mapping[tuple[str, ...], Mapping[str, Any]]
@@ -168,8 +174,6 @@ def run(
         tasks: Tasks = {(water, sea): {"water": water, "sea": sea} for water in WATERS for sea in SEAS}
         _run_processes("beams", ("water", "sea"), tasks, _BEAM_COLUMNS, json, "beams")
         return
-    from mitransient_lidar.loading.instruments import instrument_names
-
     instruments = instrument_names()
     if case is not None and case not in CASES and case not in instruments:
         raise UserError(f"case = {case!r} must be one of {', '.join([*CASES, *instruments])}")
@@ -191,10 +195,6 @@ def measure_integrator(
     Rates and times belong to the passes after the first one, which also compiles. The figure of merit is 1 / (median
     relative variance x CPU time) of the waveform's bins.
     """
-    from mitransient_lidar.loading.scenes import choose_integrator
-    from mitransient_lidar.rendering.render import render
-    from mitransient_lidar.transport.scene_parts import lidar_sensor
-
     marks: list[tuple[float, float]] = []
     loaded = _load(case)
     start = time.perf_counter()
@@ -227,9 +227,6 @@ def measure_integrator(
 
 def _load(case: str) -> mi.Scene:
     """Load a case's scene."""
-    from mitransient_lidar.loading.catalogue import scene_text
-    from mitransient_lidar.loading.scenes import open_scene
-
     if case not in CASES:
         return open_scene(*INSTRUMENT_CASE, case).scene
     name, parameters = CASES[case]
@@ -243,11 +240,6 @@ def _load(case: str) -> mi.Scene:
 
 def _plain_ray_rate(renderer: PassRenderer) -> float:
     """Return the rays per second of plain ``ray_intersect`` from the receiver in the same scene."""
-    import drjit as dr
-    import mitsuba as mi
-
-    from mitransient_lidar.transport.rng import pass_streams
-
     scene, count, rates = renderer.scene, 2**21, []
     for attempt in range(6):
         start = renderer.sampler.sample(dr.arange(mi.UInt32, count), count, pass_streams(attempt, 0, count))
@@ -267,9 +259,6 @@ def measure_image(layout: str) -> dict[str, float]:
 
     ``wall_s`` is the render time with compilation, and ``render_s`` the time of the passes after the first two.
     """
-    from mitransient_lidar.loading.catalogue import scene_text
-    from mitransient_lidar.rendering.render import render
-
     marks: list[float] = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "images.xml"
@@ -330,8 +319,6 @@ def measure_beams(water: str, sea: str) -> dict[str, dict[str, float]]:
 
 def _measure_beam(divergence: float, view: float, water: str, sea: str) -> dict[str, float]:
     """Measure one beam and view [mrad]."""
-    from mitransient_lidar.rendering.render import render
-
     beam = {"divergence_mrad": f"{divergence:g}", "field_of_view_mrad": f"{view:g}"}
     marks: list[float] = []
     result = render(

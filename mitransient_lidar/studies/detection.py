@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -34,6 +34,7 @@ from mitransient_lidar.core.validation import in_range, require_memory, shown
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.camera import Camera
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import CAMERAS
@@ -41,10 +42,8 @@ from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.target_signal import find_target, signal_at, target_gates, target_signal
-
-if TYPE_CHECKING:
-    from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 _LOG = logging.getLogger(__name__)
 
@@ -163,8 +162,6 @@ def detect(
     renders, depths, sky = clutter or renders, list(depths), background_power_w
     if not isinstance(scene, (str, os.PathLike)) and (depths or clutter):
         raise UserError("depths and clutter need an XML scene, whose parameters they set")
-    from mitransient_lidar.transport.scene_parts import find_lidar_scene
-
     session = open_scene(scene, params, instrument)
     for option, wanted, key in (("depths", depths, "target_depth"), ("clutter", clutter, "surface_seed")):
         if wanted and key not in session.parameters:

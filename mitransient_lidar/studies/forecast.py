@@ -45,6 +45,7 @@ from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.rendering.passes import ProgressCallback
+from mitransient_lidar.rendering.shots.batches import ReceivedShots, ShotPoses
 from mitransient_lidar.rendering.shots.scene import ShotScene
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
@@ -62,6 +63,8 @@ from mitransient_lidar.studies.depth_bias import (
     SeaScene,
     SeaSeed,
 )
+from mitransient_lidar.transport.light_maps.renderer import reach_of_scattering
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 #: Largest ratio of neighbouring depths in tables, and where the share of found bottoms falls; that of waters.
 _COARSE, _FINE, _WATERS = 1.25, 1.07, 1.4
@@ -324,9 +327,6 @@ class _Bottoms:
         records: int,
         seed: int,
     ) -> None:
-        from mitransient_lidar.transport.light_maps.renderer import reach_of_scattering
-        from mitransient_lidar.transport.scene_parts import find_lidar_scene
-
         self._instrument, self._scene, self._params = instrument, scene, params
         self._records, self._seed = records, seed
         self._places = np.random.default_rng(seed).uniform(-_FARTHEST, _FARTHEST, (shots, 2))
@@ -384,8 +384,6 @@ class _Bottoms:
 
     def _by_maps(self, depths: Sequence[float], deepest: float) -> xr.Dataset:
         """Return the light of bottoms at depths up to that of their scene [m], by light maps."""
-        from mitransient_lidar.rendering.shots.batches import ReceivedShots, ShotPoses
-
         places = self._places
         if deepest not in self._sea:
             params = {**self._params, "bottom_depth": deepest}

@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -28,10 +28,12 @@ from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.results.attributes import label
-
-if TYPE_CHECKING:
-    from mitransient_lidar.transport.scene import LidarScene
-    from mitransient_lidar.transport.sensor.receiver import Receiver
+from mitransient_lidar.transport.medium.water_phases import table_of
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
+from mitransient_lidar.transport.sensor.fov_shapes import Sector
+from mitransient_lidar.transport.sensor.pixels import ShapedPixels
+from mitransient_lidar.transport.sensor.receiver import Receiver
 
 logger = logging.getLogger(__name__)
 
@@ -108,8 +110,6 @@ def fov_sweep(
     """
     fields = np.unique(fov_mrad)
     session = open_scene(scene, _with_widest(scene, params, float(fields[-1])), instrument)
-    from mitransient_lidar.transport.scene_parts import find_lidar_scene
-
     lidar = find_lidar_scene(session.scene, session.sensor)
     geometry, edge = _geometry(lidar, 0.5e-3 * float(fields[-1]))
     column = ColumnBins.between(geometry, edge, lidar.axis, min_depth, max_depth)
@@ -200,8 +200,6 @@ def _geometry(lidar: LidarScene, half_view: float) -> tuple[LidarGeometry, float
 
 def _water(lidar: LidarScene, min_depth: float, max_depth: float) -> InherentProperties:
     """Return the water between two depths [m]; reject several layers."""
-    from mitransient_lidar.transport.medium.water_phases import table_of
-
     water = lidar.required_water
     if water.plume is not None:
         raise UserError(
@@ -237,9 +235,6 @@ def _render(
 
     `of_field` has the passes for a field of view, and the time for all.
     """
-    from mitransient_lidar.transport.sensor.fov_shapes import Sector
-    from mitransient_lidar.transport.sensor.pixels import ShapedPixels
-
     assert of_field.passes is not None
     passes, chosen = of_field.passes, choose_integrator(session.scene, None)
     receiver: Receiver = session.sensor.receiver

@@ -15,9 +15,12 @@ from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accumulators import PassAccumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
+from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.results.attributes import label
+from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
 from mitransient_lidar.transport.paths.passes import MOST_ORDERS, PathClasses
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 #: Independent passes, for standard errors.
 _PASSES = 8
@@ -57,11 +60,6 @@ def estimate(
     and shadows of solids.
     """
     session = open_scene(scene, params, instrument=instrument)
-    from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
-    from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
-    from mitransient_lidar.transport.paths.passes import PathClasses
-    from mitransient_lidar.transport.scene_parts import find_lidar_scene
-
     lidar = find_lidar_scene(session.scene, session.sensor)
     renderer = LightMapRenderer(lidar, PathClasses(), level=True).by_origin()
     session.tell_axis(lidar.axis, lidar.record_end)

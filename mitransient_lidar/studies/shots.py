@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
@@ -18,17 +19,16 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.rendering.shots.truth import SLOPE_KINDS, SeaMap, Shot, footprint, transmitter_of
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.geometry import lidar_geometry
+from mitransient_lidar.transport.sensor.receiver import Receiver
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from mitransient_lidar.physics.lidar.pose import Pose
-    from mitransient_lidar.transport.sensor.receiver import Receiver
 
 #: Largest number of pixels whose footprints are mapped.
 _MOST_MAPPED_PIXELS = 64
@@ -138,8 +138,6 @@ def render_found_shots(
 
 def _pixel_map(receiver: Receiver) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Return `pixel_lines` and `pixel_map` of `RenderedShots`."""
-    import mitsuba as mi
-
     pose: Pose = receiver.pose
     centre = pose.ground_point()
     reach = 0.6 * receiver.pixels.field_of_view * pose.ground_range / -float(pose.axis[2])

@@ -175,14 +175,8 @@ class Crossings:
 class CrossingTracer:
     """Traces light from the laser to its first solid, and finds where it crosses planes.
 
-    Parameters
-    ----------
-    scene
-        Lidar scene with water.
-    depths
-        Plane depths below the mean sea level [m], increasing, shape (planes,).
-    photons
-        Light paths per pass.
+    `scene`: lidar scene with water. `depths`: plane depths below the mean sea level [m], increasing, shape (planes,).
+    `photons`: light paths per pass.
     """
 
     def __init__(self, scene: LidarScene, depths: FloatArray, photons: int) -> None:

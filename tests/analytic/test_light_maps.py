@@ -25,9 +25,9 @@ from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 
-def lidar_of(params):
-    """Return the lidar of the default scene with other parameters, and the scene, which keeps it alive."""
-    session = open_scene("table1", params)
+def lidar_of(params, scene="table1"):
+    """Return the lidar of a scene with other parameters, and the scene, which keeps it alive."""
+    session = open_scene(scene, params)
     return find_lidar_scene(session.scene, session.sensor), session
 
 
@@ -55,12 +55,14 @@ def test_rays_meet_the_faces_that_the_mesh_has():
         pytest.param({"attenuation": 0.8, "scattering": 0.6, "bottom_depth": 5}, 12, marks=pytest.mark.long),
         pytest.param({"divergence_mrad": 1.5, "field_of_view_mrad": 6}, 24, marks=pytest.mark.long),
         pytest.param({"attenuation": 0.2, "scattering": 0.05, "wind_speed": 6}, 12, marks=pytest.mark.long),
+        # 0.4 m deep, 5.7 m before the water line.
+        pytest.param({"aim_x": -4.3, "divergence_mrad": 2, "field_of_view_mrad": 8, "wind_speed": 5}, 12),
     ],
-    ids=["table1", "waves", "turbid", "narrow", "clear"],
+    ids=["table1", "waves", "turbid", "narrow", "clear", "beach"],
 )
 def test_maps_agree_with_merging(params, passes):
     """Water and bottom of each pixel, within 1 % and their errors; times of bottoms within 0.06 ns and theirs."""
-    lidar, session = lidar_of(params)
+    lidar, session = lidar_of(params, "beach" if "aim_x" in params else "table1")
     merging = session.scene.integrator().prepare(session.scene, session.sensor).by_origin()
     maps = LightMapRenderer(lidar, PathClasses()).by_origin().scaled(8)
 
@@ -123,6 +125,16 @@ def test_shots_that_light_a_target_are_merged():
     places = np.array([[-42.6, 60.0], [-41.0, 60.0], [-45.0, 60.0], [-41.0, 63.0], [0.0, 0.0]])
     scene = ShotScene("flight", {"cube_x": -41, "cube_y": 60}, places, light="maps", check=False)
     np.testing.assert_array_equal(suits_maps(scene.lidar, ShotPoses(places)), [False, False, True, True, True])
+
+
+@pytest.mark.slow
+def test_shots_over_land_are_merged():
+    """The water line of `beach` is at x = 1.4 m, and 5 cm deep water at 0.7 m; half of the beam is 4 m long."""
+    places = np.array([[-30.0, 0.0], [-6.0, 8.0], [0.0, 0.0], [4.0, 0.0], [30.0, 0.0]])
+    scene = ShotScene("beach", {"divergence_mrad": 2, "field_of_view_mrad": 8}, places, light="maps", check=False)
+    np.testing.assert_array_equal(suits_maps(scene.lidar, ShotPoses(places)), [True, True, False, False, False])
+    with pytest.raises(UserError, match="do not suit the scene: solids reach the surface in 3 shots"):
+        mitransient_lidar.render_shots("beach", positions=places, light="maps")
 
 
 @pytest.mark.slow

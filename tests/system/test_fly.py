@@ -224,6 +224,7 @@ def test_failed_pulses_end_with_exit_code_1(tmp_path, monkeypatch, in_this_proce
         return stacked(renderer, numbers, inputs)
 
     monkeypatch.setattr(FlightRenderer, "stacked", fails)
+    monkeypatch.setattr("mitransient_lidar.flights.renderer._BATCH", 2)
     out = run("fly", path, "-o", folder, "--workers", 1, "-q")
     failed = np.count_nonzero(Store(folder / STORE).status() == FAILED)
     assert 0 < failed < 4
@@ -237,6 +238,7 @@ def test_command_refuses_bad_flights(tmp_path):
     for wrong, message in (
         (TOML.replace("rate_hz = 320.0", "rate_hz = -1"), "rate_hz = -1"),
         ('crs = "EPSG:999999"' + TOML, "crs = 'EPSG:999999'"),
+        ("object_class = 44" + TOML, "object_class = 44 must be one of 43, 46, 64"),
     ):
         path.write_text(wrong)
         assert_refused(run("fly", path, "-o", tmp_path / "out"), message)
@@ -283,6 +285,39 @@ def test_infrared_pulses_give_the_surface_of_a_flight(tmp_path, in_this_process)
     assert np.sqrt(np.mean(error[(kind == PointClass.SURFACE) & infrared] ** 2)) < 0.012
     with laspy.open(tmp_path / "flight" / "points.laz") as file:
         np.testing.assert_array_equal(file.read()["quality"] & int(Quality.INFRARED) > 0, infrared)
+
+
+@pytest.mark.slow
+def test_infrared_lines_of_their_own(tmp_path):
+    """Twice as many pulses, straight down, whose points follow those of the green channel with their own numbers."""
+    plan = {
+        **{"scene": "flight", "instrument": "riegl_vq880g2", "still_sea": True, "light": "maps", "target_error": 0.3},
+        "parameters": {"spectrum": "flat", "bottom_ripple_height": 0, "bottom_depth": 2, "cube_x": 99},
+        "platform": {**FLIGHT["platform"], "height": 300.0, "noise": {}},
+        "scanner": {"kind": "fixed", "nadir_angle_deg": 3.0},
+        "pulses": {"rate_hz": 60.0, "most": 3},
+        "infrared_lines": {"scanner": {"kind": "fixed"}, "pulses": {"rate_hz": 120.0, "most": 6}},
+    }
+    points = fly(plan, tmp_path / "flight", workers=1).load()
+    kind, shot, transmitter = (points[name].values for name in ("kind", "shot", "transmitter"))
+    assert shot[transmitter == 1].tolist() == [*range(6)]
+    assert (kind[transmitter == 1] == PointClass.SURFACE).all()
+    assert np.count_nonzero(kind[transmitter == 0] == PointClass.BOTTOM) == 3
+    # Light of the water delays infrared surfaces by at most 4.7 cm.
+    assert np.abs(points["z"].values[transmitter == 1]).max() < 0.04
+    # The level is that of both channels.
+    assert abs(points.attrs["surface_level_m"]) < 0.02
+    lines = describe_points(points)
+    assert lines[lines.index("Infrared channel") + 2].split()[:3] == ["water", "surface", "6"]
+    with laspy.open(tmp_path / "flight" / "points.laz") as file:
+        np.testing.assert_array_equal(file.read()["user_data"], transmitter)
+    waveforms = laspy.read(tmp_path / "flight" / "waveforms.las")
+    assert len(waveforms.points) == np.count_nonzero(transmitter == 0)
+    assert read_points(tmp_path / "flight").sizes == points.sizes
+    with pytest.raises(UserError, match=r"infrared = true and \[infrared_lines\] are alternatives"):
+        FlightPlan.of_file({**plan, "infrared": True})
+    with pytest.raises(UserError, match="has no infrared channel"):
+        FlightPlan.of_file({**plan, "instrument": "riegl_vq840g"})
 
 
 @pytest.mark.slow

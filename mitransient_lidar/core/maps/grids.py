@@ -205,16 +205,8 @@ def write_geotiff(
 ) -> None:
     """Write maps as the named bands of a GeoTIFF, in single precision with NaN for no data.
 
-    Parameters
-    ----------
-    path
-        The file.
-    bands
-        Values by name, shape (rows, columns) with increasing y and x.
-    x, y
-        Evenly spaced column and row positions in map coordinates, at least 2 each.
-    wkt
-        Coordinate system, empty if it is unknown.
+    `path`: the file. `bands`: values by name, shape (rows, columns) with increasing y and x. `x`, `y`: evenly spaced
+    column and row positions in map coordinates, at least 2 each. `wkt`: coordinate system, empty if it is unknown.
     """
     import rasterio
 

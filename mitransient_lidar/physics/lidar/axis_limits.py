@@ -267,14 +267,9 @@ def system_attenuation(attenuation: npt.ArrayLike, kd: npt.ArrayLike, spot_diame
     Returns K = Kd + (c - Kd) exp(-0.85 c D) [1/m], in the broadcast shape of the parameters. Without its geometric
     factors the signal is proportional to exp(-2 K s) with the distance s in the water.
 
-    Parameters
-    ----------
-    attenuation : array_like
-        Beam attenuation coefficient c [1/m], at least `kd`.
-    kd : array_like
-        Diffuse attenuation coefficient Kd of downwelling irradiance [1/m], at least 0.
-    spot_diameter : array_like
-        Diameter D of the spot on the sea surface that the lidar illuminates and views [m], at least 0.
+    `attenuation`: beam attenuation coefficient c [1/m], at least `kd`. `kd`: diffuse attenuation coefficient Kd of
+    downwelling irradiance [1/m], at least 0. `spot_diameter`: diameter D of the spot on the sea surface that the lidar
+    illuminates and views [m], at least 0.
 
     Notes
     -----

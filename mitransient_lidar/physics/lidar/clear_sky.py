@@ -109,14 +109,9 @@ def _forward_fraction(cosine: float, exponent: float) -> float:
 def background_power(radiance: npt.ArrayLike, etendue: npt.ArrayLike, filter_width_nm: float) -> FloatArray:
     """Daylight power on a detector [W], the product of the arguments.
 
-    Parameters
-    ----------
-    radiance : array_like
-        Radiance [W m^-2 sr^-1 nm^-1].
-    etendue : array_like
-        Open aperture area times pixel solid angle times transmittance of optics and air [m^2 sr].
-    filter_width_nm : float
-        Filter width [nm], positive: its integral over its peak, which is part of the transmittance.
+    `radiance`: radiance [W m^-2 sr^-1 nm^-1]. `etendue`: open aperture area times pixel solid angle times transmittance
+    of optics and air [m^2 sr]. `filter_width_nm`: filter width [nm], positive: its integral over its peak, which is
+    part of the transmittance.
     """
     width = positive("filter_width_nm", filter_width_nm)
     return np.asarray(finite_array("radiance", radiance) * finite_array("etendue", etendue) * width)

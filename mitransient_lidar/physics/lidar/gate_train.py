@@ -231,14 +231,8 @@ class GateTrain(Checked):
     def gate_bins(self, gate: int, time_start_ns: float, bin_width_ns: float, bin_count: int) -> tuple[int, FloatArray]:
         """Mean gate transmission in the time bins that the gate overlaps.
 
-        Parameters
-        ----------
-        gate : int
-            Gate index, 0 to count - 1.
-        time_start_ns, bin_width_ns : float
-            Start of the first bin, and bin width [ns].
-        bin_count : int
-            Number of bins, 1 to 10^9.
+        `gate`: gate index, 0 to count - 1. `time_start_ns`, `bin_width_ns`: start of the first bin, and bin width [ns].
+        `bin_count`: number of bins, 1 to 10^9.
 
         Returns
         -------

@@ -52,14 +52,8 @@ class LevelSea:
 
         Returns x, y [m], shape (..., 2); NaN for rays that do not go down.
 
-        Parameters
-        ----------
-        origin
-            Point in the air, x, y, z [m], or one for each ray, shape (..., 3).
-        directions
-            Ray directions in the air, of any length, shape (..., 3).
-        z
-            Heights [m], below the origin, shape (...).
+        `origin`: point in the air, x, y, z [m], or one for each ray, shape (..., 3). `directions`: ray directions in
+        the air, of any length, shape (..., 3). `z`: heights [m], below the origin, shape (...).
         """
         rays = finite_array("directions", directions)
         level = np.broadcast_to(finite_array("z", z), rays.shape[:-1])
@@ -129,14 +123,8 @@ def turn_by_slope(theta: npt.ArrayLike, n: float) -> FloatArray:
 def refract(direction: FloatArray, normal: FloatArray, n: float) -> FloatArray:
     """Return unit directions refracted from air into water by a facet, shape (..., 2 or 3).
 
-    Parameters
-    ----------
-    direction
-        Unit directions of propagation in the air, shape (..., 2 or 3).
-    normal
-        Facet normals into the air, of any length, with the same shape.
-    n
-        Refractive index of the water relative to air, at least 1.
+    `direction`: unit directions of propagation in the air, shape (..., 2 or 3). `normal`: facet normals into the air,
+    of any length, with the same shape. `n`: refractive index of the water relative to air, at least 1.
     """
     unit = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
     cosine = -np.sum(direction * unit, axis=-1, keepdims=True)

@@ -43,14 +43,9 @@ class Pose:
     def from_angles(cls, altitude: float, off_nadir_deg: float, aim_x: float = 0.0, aim_y: float = 0.0) -> Self:
         """Return the pose whose axis lies in the x-z plane and points to +x, and down or, under water, up.
 
-        Parameters
-        ----------
-        altitude
-            Height above the mean sea level [m], 0.1 to 1e6, or -1000 to -0.1 under water.
-        off_nadir_deg
-            Axis angle from the downward vertical [deg], 0 to 89.9, or 0 to 180 under water.
-        aim_x, aim_y
-            Point where the axis meets the mean sea level [m], -1e7 to 1e7; under water the point above the pose.
+        `altitude`: height above the mean sea level [m], 0.1 to 1e6, or -1000 to -0.1 under water. `off_nadir_deg`: axis
+        angle from the downward vertical [deg], 0 to 89.9, or 0 to 180 under water. `aim_x`, `aim_y`: point where the
+        axis meets the mean sea level [m], -1e7 to 1e7; under water the point above the pose.
 
         Values out of range raise UserError.
         """

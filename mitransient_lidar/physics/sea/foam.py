@@ -25,12 +25,7 @@ def foam_cover(foam: str, wind_speed: float) -> float:
 
     Raises UserError if `foam` is none of what it may be.
 
-    Parameters
-    ----------
-    foam
-        ``none``, a number from 0 to 1, or the name of a law.
-    wind_speed
-        Wind speed U at 10 m [m/s].
+    `foam`: ``none``, a number from 0 to 1, or the name of a law. `wind_speed`: wind speed U at 10 m [m/s].
 
     Notes
     -----
@@ -90,14 +85,9 @@ def crest_heights(sample: Callable[[FloatArray, FloatArray], FloatArray], x: Flo
 def foam_on_crests(crests: FloatArray, all_crests: FloatArray, cover: FloatArray) -> FloatArray:
     """Return the foam share at points [1]: 1 on the highest crests, as many as the cover needs, and 0 elsewhere.
 
-    Parameters
-    ----------
-    crests
-        `crest_heights` at the points [m], of any shape.
-    all_crests
-        Crest heights at points all over the sea [m], shape (n,). Where they are all equal, the cover is the share.
-    cover
-        Share of the sea with foam about each point [1], in the shape of `crests`.
+    `crests`: `crest_heights` at the points [m], of any shape. `all_crests`: crest heights at points all over the sea
+    [m], shape (n,). Where they are all equal, the cover is the share. `cover`: share of the sea with foam about each
+    point [1], in the shape of `crests`.
     """
     if all_crests.min() == all_crests.max():
         return np.asarray(cover, dtype=np.float64)

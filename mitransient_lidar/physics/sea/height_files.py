@@ -131,16 +131,8 @@ def position_unit(path: Path, stated: Stated) -> float:
 def check_positions(path: Path, stated: Stated, x: FloatArray, y: FloatArray, cell: float) -> None:
     """Refuse positions in degrees, or whose metres differ from metres on the ground.
 
-    Parameters
-    ----------
-    path : Path
-        Their file, for messages.
-    stated : Stated
-        Statements of the file about them.
-    x, y : ndarray
-        Positions as in the file, at least the least and the largest of them.
-    cell : float
-        Typical distance between neighbours.
+    `path`: their file, for messages. `stated`: statements of the file about them. `x`, `y`: positions as in the file,
+    at least the least and the largest of them. `cell`: typical distance between neighbours.
     """
     middle = [0.5 * float(one.min() + one.max()) for one in (x, y)]
     if stated.system is not None:
@@ -276,16 +268,9 @@ def grid_of_points(path: Path, points: FloatArray, stated: Stated, cell: float |
     Raises UserError if there are fewer than 3 points, they are on a line, or too many; or the cell is more than half of
     their extent.
 
-    Parameters
-    ----------
-    path : Path
-        Their file, for messages.
-    points : ndarray, shape (points, 3)
-        Positions and heights [m]; points with a height of NaN are left out.
-    stated : Stated
-        Statements of the file about them.
-    cell : float, optional
-        Cell of the grid on which scattered points are interpolated [m].
+    `path`: their file, for messages. `points`: positions and heights [m]; points with a height of NaN are left out,
+    shape (points, 3). `stated`: statements of the file about them. `cell`: cell of the grid on which scattered points
+    are interpolated [m].
     """
     if missing := int(np.isnan(points[:, 2]).sum()):
         logger.warning("%s: %d of %d points have no height and are left out", path, missing, len(points))

@@ -138,16 +138,9 @@ def facet_slope_variance(
 ) -> tuple[float, float]:
     """Return the slope variances [1] along and across an axis for the facets that sample waves.
 
-    Parameters
-    ----------
-    variance
-        Elevation variances [m^2] of the waves, shape (len(iy), len(ix)); overwritten.
-    ix, iy
-        Their numbers of wavelengths along x and y over the period, from `wave_numbers`.
-    period, cells
-        Period [m], and its length in cells, which may be broken.
-    axis
-        Direction [rad], counter-clockwise from +x.
+    `variance`: elevation variances [m^2] of the waves, shape (len(iy), len(ix)); overwritten. `ix`, `iy`: their numbers
+    of wavelengths along x and y over the period, from `wave_numbers`. `period`, `cells`: period [m], and its length in
+    cells, which may be broken. `axis`: direction [rad], counter-clockwise from +x.
 
     Notes
     -----

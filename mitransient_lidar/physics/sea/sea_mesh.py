@@ -35,16 +35,9 @@ def grid_indices(cells: int, extent: int, growth: float = _GROWTH, meshes: int =
 
     Raises UserError if the meshes exceed the memory.
 
-    Parameters
-    ----------
-    cells
-        Cells per side in the fine patch, even.
-    extent
-        Side of the whole mesh in these cells, at least `cells`.
-    growth
-        Ratio between the lengths of neighbouring cells outside the patch, above 1.
-    meshes
-        Number of such meshes made at a time.
+    `cells`: cells per side in the fine patch, even. `extent`: side of the whole mesh in these cells, at least `cells`.
+    `growth`: ratio between the lengths of neighbouring cells outside the patch, above 1. `meshes`: number of such
+    meshes made at a time.
 
     Returns
     -------
@@ -79,14 +72,8 @@ def triangulate(heights: FloatArray, x: FloatArray, y: FloatArray, wind_directio
 
     Cells are split along the diagonal from (i+1, j) to (i, j+1), as `realization.facet_slope_variance` assumes.
 
-    Parameters
-    ----------
-    heights
-        Elevation [m], shape (len(y), len(x)).
-    x, y
-        Grid line positions [m], increasing.
-    wind_direction
-        Direction of the first texture coordinate [rad], counter-clockwise from +x.
+    `heights`: elevation [m], shape (len(y), len(x)). `x`, `y`: grid line positions [m], increasing. `wind_direction`:
+    direction of the first texture coordinate [rad], counter-clockwise from +x.
     """
     east, north = np.meshgrid(x, y)
     vertices = np.stack([east, north, heights], axis=-1).reshape(-1, 3)

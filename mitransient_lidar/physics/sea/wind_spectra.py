@@ -192,15 +192,9 @@ class PiersonMoskowitzSpectrum(SaturatedSpectrum):
 class JonswapSpectrum(SaturatedSpectrum):
     """Gravity wave spectrum of a fetch-limited sea.
 
-    Parameters
-    ----------
-    wind_speed, direction : float
-        As for `ElfouhailySpectrum`, but with a wind speed above 0.
-    fetch : float
-        Distance from the upwind shore [m]: g fetch/U^2 from 0.1, the start of the measurements, to 17 000, where the
-        peak reaches the fully developed sea's peak and the growth ends.
-    peak_enhancement : float
-        gamma, 1 to 7; the mean over the measurements is 3.3.
+    `wind_speed`, `direction`: as for `ElfouhailySpectrum`, but with a wind speed above 0. `fetch`: distance from the
+    upwind shore [m]: g fetch/U^2 from 0.1, the start of the measurements, to 17 000, where the peak reaches the fully
+    developed sea's peak and the growth ends. `peak_enhancement`: gamma, 1 to 7; the mean over the measurements is 3.3.
 
     Notes
     -----

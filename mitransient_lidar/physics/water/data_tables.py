@@ -29,14 +29,8 @@ def log_log_interpolation(
 ) -> PhaseFunction:
     """Interpolate positive values so that ln p is linear in ln theta.
 
-    Parameters
-    ----------
-    theta : ndarray, shape (N,)
-        Angles [rad], increasing, above 0.
-    values : ndarray, shape (N,)
-        Values, above 0.
-    extrapolation : callable
-        Change in ln p below the first angle, as a function of ln(theta/theta[0]).
+    `theta`: angles [rad], increasing, above 0, shape (N,). `values`: values, above 0, shape (N,). `extrapolation`:
+    change in ln p below the first angle, as a function of ln(theta/theta[0]).
     """
     log_theta, log_p = np.log(theta), np.log(values)
 
@@ -52,14 +46,9 @@ def log_log_interpolation(
 def log_log_phase(degrees: FloatArray, values: FloatArray, power: float | None = None) -> PhaseFunction:
     """Interpolate a table so that ln p is linear in ln theta, and normalise it.
 
-    Parameters
-    ----------
-    degrees : ndarray, shape (N,)
-        Scattering angles [deg], increasing, the first above 0 and the last 180.
-    values : ndarray, shape (N,)
-        The phase function in any unit per solid angle, above 0.
-    power : float, optional
-        Below the first angle p ~ theta^power, above -2. By default the power between the first two angles.
+    `degrees`: scattering angles [deg], increasing, the first above 0 and the last 180, shape (N,). `values`: the phase
+    function in any unit per solid angle, above 0, shape (N,). `power`: below the first angle p ~ theta^power, above -2.
+    By default the power between the first two angles.
     """
     log_theta, log_p = np.log(np.radians(degrees)), np.log(values)
     slope = (log_p[1] - log_p[0]) / (log_theta[1] - log_theta[0]) if power is None else power

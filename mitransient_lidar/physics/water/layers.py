@@ -25,16 +25,10 @@ class WaterColumn:
     Raises UserError if a value is not finite or negative, the lengths differ, the layers are out of order, or bb <= b
     <= c fails.
 
-    Parameters
-    ----------
-    layer_tops : array_like, shape (L,)
-        Depth of each layer's upper edge [m]. The first is 0 and they increase strictly.
-    attenuation : array_like, shape (L,)
-        Beam attenuation coefficient c [1/m], at least `scattering`, at most 1000.
-    scattering : array_like, shape (L,)
-        Scattering coefficient b [1/m], at least `backscattering`.
-    backscattering : array_like, shape (L,)
-        Backscattering coefficient bb [1/m], the part of b into the backward hemisphere, at least 0.
+    `layer_tops`: depth of each layer's upper edge [m], shape (L,). The first is 0 and they increase strictly.
+    `attenuation`: beam attenuation coefficient c [1/m], at least `scattering`, at most 1000, shape (L,). `scattering`:
+    scattering coefficient b [1/m], at least `backscattering`, shape (L,). `backscattering`: backscattering coefficient
+    bb [1/m], the part of b into the backward hemisphere, at least 0, shape (L,).
     """
 
     layer_tops: FloatArray

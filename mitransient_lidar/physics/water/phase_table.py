@@ -56,14 +56,9 @@ class PowerLawTable:
 
         Raises UserError if a value is not positive and finite, or the integral towards s = 0 diverges.
 
-        Parameters
-        ----------
-        values : array_like, shape (N,)
-            p at nodes uniform in ln s from log_s0 to 0, in any common unit; positive; N at least 2.
-        log_s0 : float
-            ln s at the first node, negative.
-        cap_probability : float, optional
-            4 pi int_0^s_0 p ds in the unit of `values`. By default the first segment's power law continues to s = 0.
+        `values`: p at nodes uniform in ln s from log_s0 to 0, in any common unit; positive; N at least 2, shape (N,).
+        `log_s0`: ln s at the first node, negative. `cap_probability`: 4 pi int_0^s_0 p ds in the unit of `values`. By
+        default the first segment's power law continues to s = 0.
         """
         p = finite_array("values", values)
         if p.ndim != 1 or p.size < 2:

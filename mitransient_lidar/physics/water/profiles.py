@@ -88,14 +88,9 @@ class Profile:
     All coefficients are linear between the nodes, constant above the first and below the last. Read one from a file
     with `read_profile`.
 
-    Parameters
-    ----------
-    depth : array_like, shape (N,)
-        Depths of the nodes below the mean sea level [m], at least 0, strictly increasing; N at least 2.
-    absorption, scattering : array_like, shape (N,)
-        Absorption a and scattering b at the nodes [1/m], at least 0.
-    backscattering : array_like, shape (N,)
-        Backscattering bb at the nodes [1/m], from 0 to `scattering`.
+    `depth`: depths of the nodes below the mean sea level [m], at least 0, strictly increasing; N at least 2, shape
+    (N,). `absorption`, `scattering`: absorption a and scattering b at the nodes [1/m], at least 0, shape (N,).
+    `backscattering`: backscattering bb at the nodes [1/m], from 0 to `scattering`, shape (N,).
     """
 
     depth: FloatArray

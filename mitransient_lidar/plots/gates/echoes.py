@@ -23,15 +23,8 @@ _NAMED_PIXELS = 16  # on an axis
 def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_depth: float | None = None) -> Figure:
     """Draw the depth of the strongest echo in every pixel, and its confidence, from `range_images.depth_image`.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A gate stack with the coordinate ``gate_depth``.
-    path : path, optional
-        File to write.
-    from_depth : float, optional
-        Leave out gates whose middle is shallower on the axis [m]; by default those that open before the end of the
-        surface echo.
+    `dataset`: a gate stack with the coordinate ``gate_depth``. `path`: file to write. `from_depth`: leave out gates
+    whose middle is shallower on the axis [m]; by default those that open before the end of the surface echo.
 
     Raises
     ------

@@ -244,16 +244,9 @@ def page_text(
 ) -> str:
     """Return the text of a page.
 
-    Parameters
-    ----------
-    title, kind
-        Name of what the page shows, and what that is.
-    traces
-        Traces of Plotly with coordinates x, y, z [m].
-    views
-        Boxes that the page can show by name, lowest and highest corner [m], shape (2, 3); it opens with the first one.
-    notes
-        Sentences below the drawing.
+    `title`, `kind`: name of what the page shows, and what that is. `traces`: traces of Plotly with coordinates x, y, z
+    [m]. `views`: boxes that the page can show by name, lowest and highest corner [m], shape (2, 3); it opens with the
+    first one. `notes`: sentences below the drawing.
     """
     import plotly.graph_objects as go
     from plotly.offline import get_plotlyjs

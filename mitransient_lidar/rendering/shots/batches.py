@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
@@ -21,17 +20,21 @@ from mitransient_lidar.rendering.accumulators import Light
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
 from mitransient_lidar.transport.light_maps.heights import HeightFields
-from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer, light_faintly
+from mitransient_lidar.transport.light_maps.renderer import (
+    REACH_THE_SURFACE,
+    LightMapRenderer,
+    UnsuitedError,
+    light_faintly,
+    over_water,
+)
 from mitransient_lidar.transport.medium.bubbles import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.paths.passes import PassRenderer
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.probe import land_of_shots
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
 from mitransient_lidar.transport.solids import scene_of_shapes
-
-if TYPE_CHECKING:
-    from mitransient_lidar.transport.paths.passes import PassRenderer
 
 #: Paths of all shots in a launch, and time bins of all their pixels.
 _PATHS, _BINS = 2**17, 2**24
@@ -116,14 +119,8 @@ class ShotPoses:
     def scene_part(self, shapes: mi.Scene, positions: FloatArray | None, aim: FloatArray) -> ScenePart:
         """Return shapes as the shots meet them.
 
-        Parameters
-        ----------
-        shapes
-            The shapes.
-        positions
-            Points (x, y) among them of the shots' places [m], shape (shots, 2); None for shapes that go with the lidar.
-        aim
-            Place (x, y) of the lidar in its frame [m], shape (2,).
+        `shapes`: the shapes. `positions`: points (x, y) among them of the shots' places [m], shape (shots, 2); None for
+        shapes that go with the lidar. `aim`: place (x, y) of the lidar in its frame [m], shape (2,).
         """
         if positions is None:
             positions = np.broadcast_to(aim, (len(self), 2))
@@ -407,10 +404,17 @@ def _errors(window: ErrorWindow | None, light: Light) -> FloatArray:
 
 
 def suits_maps(lidar: LidarScene, poses: ShotPoses) -> BoolArray:
-    """Return which shots of a scene that suits light maps light its targets so faintly that maps serve them."""
+    """Return which shots of a scene that suits light maps serve: over water, with faint light on targets."""
     places = poses.places - lidar.frame_origin[:2]
     faint = [light_faintly(lidar, target, places, poses.turns) for target in lidar.targets]
-    return np.all(faint, axis=0) if faint else np.ones(len(poses), dtype=bool)
+    return np.asarray(np.all([over_water(lidar, places, poses.turns), *faint], axis=0))
+
+
+def require_water(lidar: LidarScene, poses: ShotPoses) -> None:
+    """Raise `UnsuitedError` if light maps do not suit shots, since they meet land, or solids near the surface."""
+    dry = ~over_water(lidar, poses.places - lidar.frame_origin[:2], poses.turns)
+    if dry.any():
+        raise UnsuitedError(f"light maps do not suit the scene: {REACH_THE_SURFACE} in {np.count_nonzero(dry)} shots")
 
 
 def share_for_error(error: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -21,6 +21,7 @@ from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, ope
 from mitransient_lidar.physics.lidar.gate_train import GateSequence, GateTrain
 from mitransient_lidar.rendering.accumulators import placed_gates
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
+from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
 from mitransient_lidar.rendering.passes import (
     DEFAULT_MAX_MEMORY_GB,
     PassShare,
@@ -30,12 +31,13 @@ from mitransient_lidar.rendering.passes import (
     pass_seed,
     warn_of_edge_loss,
 )
+from mitransient_lidar.rendering.scene_checks import check_scene
+from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotPoses
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.gate_stack import build_gates
-
-if TYPE_CHECKING:
-    from mitransient_lidar.transport.paths.histogram import GateWeights
-    from mitransient_lidar.transport.paths.passes import PassRenderer
+from mitransient_lidar.transport.paths.histogram import GateWeights
+from mitransient_lidar.transport.paths.passes import PassRenderer
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 _LOG = logging.getLogger(__name__)
 
@@ -122,9 +124,6 @@ def render_frames(
     moving |= {"speed": speed, "heading_deg": heading_deg}
     sequence = GateSequence(plan.train.count, plan.train.pulses, frames, **moving, seed=seed)
     _check_size(sequence, session.sensor.receiver.pixels.count, limit)
-    from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
-    from mitransient_lidar.rendering.scene_checks import check_scene
-
     chosen = choose_integrator(session.scene, integrator)
     renderer = _prepare(session, chosen, sequence)
     lidar = renderer.scene
@@ -162,8 +161,6 @@ def render_frames(
 
 def _prepare(session: LoadedScene, integrator: Any, sequence: GateSequence) -> PassRenderer:
     """Return the scene's renderer, whose record contains the light at all platform locations."""
-    from mitransient_lidar.transport.scene_parts import find_lidar_scene
-
     loaded = session.scene, session.sensor
     ends = np.array([sequence.frames - 1]), np.arange(sequence.gates), sequence.pulses - 1
     last = sequence.displacements(sequence.times(*ends).max())
@@ -193,9 +190,6 @@ class _Images:
     def __init__(
         self, renderer: PassRenderer, sequence: GateSequence, train: GateTrain, passes: int, share: float, seed: int
     ) -> None:
-        from mitransient_lidar.rendering.shots.batches import ShotBatches
-        from mitransient_lidar.transport.paths.histogram import GateWeights
-
         lidar = renderer.scene
         self._sequence, self._passes, self._seed = sequence, passes, seed
         pulse, response = lidar.transmitter.pulse, lidar.receiver.optics.response_time_ns
@@ -241,8 +235,6 @@ class _Images:
 
     def _render(self, rows: IntArray) -> PassStatistics:
         """Return the energies of some images [J], shape (image, pixel)."""
-        from mitransient_lidar.rendering.shots.batches import ShotPoses
-
         frame, gate = np.divmod(rows, self._sequence.gates)
         found, at, before = PassStatistics(), None, np.full(rows.size, np.nan)
         for number in range(self._passes):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import xarray as xr
 
@@ -14,15 +15,17 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accumulators import described
-
-if TYPE_CHECKING:
-    import mitsuba as mi
-
-    from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.rendering.shots.batches import ReceivedShots, ShotBatches
-    from mitransient_lidar.transport.paths.passes import PassRenderer
-    from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.rendering.accuracy import ErrorWindow
+from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
+from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
+from mitransient_lidar.rendering.scene_checks import check_scene
+from mitransient_lidar.rendering.shots.batches import ReceivedShots, ShotBatches, check_size
+from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
+from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, check_solids
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 #: Parameters of the scene that shots replace, and those that they replace to move the target.
 AIM, TARGET = ("aim_x", "aim_y"), ("target_x", "target_y")
@@ -75,14 +78,6 @@ class ShotScene:
         check: bool = True,
         light: str = "merging",
     ) -> None:
-        from mitransient_lidar.rendering.accuracy import ErrorWindow
-        from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
-        from mitransient_lidar.rendering.describe import describe_scene
-        from mitransient_lidar.rendering.scene_checks import check_scene
-        from mitransient_lidar.rendering.shots.batches import check_size
-        from mitransient_lidar.transport.paths.passes import check_solids
-        from mitransient_lidar.transport.scene_parts import find_lidar_scene
-
         variants.leave_the_gpu("shots are rendered")
         self._open = functools.partial(open_scene, scene, instrument=instrument, sensor=sensor)
         self._params, self._target = params, target
@@ -113,10 +108,6 @@ class ShotScene:
         """Return the renderer of the scene's own shot."""
         loaded = self.session.scene, self.session.sensor
         if light == "maps":
-            from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
-            from mitransient_lidar.transport.paths.passes import PathClasses
-            from mitransient_lidar.transport.scene_parts import find_lidar_scene
-
             return LightMapRenderer(find_lidar_scene(*loaded, axis=axis), PathClasses())
         renderer: PassRenderer = self._integrator.prepare(*loaded, axis=axis)
         return renderer
@@ -138,8 +129,6 @@ class ShotScene:
 
     def batches(self, passes: int, share: float, error: float | None) -> ShotBatches:
         """Return the shots in batches, for passes with a share of a full pass's paths, or until a relative error."""
-        from mitransient_lidar.rendering.shots.batches import ShotBatches
-
         return ShotBatches(self._renderer, self._place, passes, share, error, self.window, self.companions)
 
     def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:
@@ -154,8 +143,6 @@ class ShotScene:
 
     def dataset(self, received: ReceivedShots, attributes: Mapping[str, Any]) -> xr.Dataset:
         """Return the labelled result."""
-        from mitransient_lidar.rendering.describe import with_lines_of_sight
-
         pixels = self.lidar.receiver.pixels
         dataset = results.build_series(
             *received.whole,

@@ -8,8 +8,9 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
@@ -45,14 +46,18 @@ from mitransient_lidar.rendering.passes import (
     RenderOptions,
     warn_of_edge_loss,
 )
+from mitransient_lidar.rendering.shots.batches import (
+    MOST_PASSES_FOR_ERROR,
+    ReceivedShots,
+    ShotPoses,
+    require_water,
+    share_for_error,
+    suits_maps,
+)
 from mitransient_lidar.rendering.shots.scene import AIM, TARGET, ShotScene
 from mitransient_lidar.rendering.shots.truth import SeaMap, sea_of, truth_coordinates
 from mitransient_lidar.results.attributes import described, join
-
-if TYPE_CHECKING:
-    import mitsuba as mi
-
-    from mitransient_lidar.rendering.shots.batches import ReceivedShots
+from mitransient_lidar.transport.light_maps.renderer import UnsuitedError
 
 _LOG = logging.getLogger(__name__)
 
@@ -195,15 +200,6 @@ def render_shots(
         If the scene is invalid, has no waves for random locations, or lacks a parameter, or a number is out of range.
     """
     options_given = {**locals(), "infrared": False}
-    from mitransient_lidar.rendering.shots.batches import (
-        MOST_PASSES_FOR_ERROR,
-        ReceivedShots,
-        ShotPoses,
-        share_for_error,
-        suits_maps,
-    )
-    from mitransient_lidar.transport.light_maps.renderer import UnsuitedError
-
     if infrared:
         (_, own), (channel, other) = with_infrared(instrument, params)
         green = render_shots(**options_given | {"params": own})
@@ -233,6 +229,8 @@ def render_shots(
     channels: dict[str, Any] = {"components": bool(components), "derivatives": derivatives or (), "light": light}
     try:
         series = ShotScene(scene, params, places, **source, target=target, axis=axis, **channels)
+        if light == "maps" and not merge_unsuited:
+            require_water(series.lidar, ShotPoses(places))
         suits = light == "merging" or not merge_unsuited or bool(suits_maps(series.lidar, ShotPoses(places)).all())
     except UnsuitedError:
         suits = False

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.sea.height_maps import HeightMap
+from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.physics.water.water_types import InherentProperties
+from mitransient_lidar.rendering.shots.batches import ShotPoses
 from mitransient_lidar.results.attributes import described
-
-if TYPE_CHECKING:
-    import mitsuba as mi
-
-    from mitransient_lidar.physics.sea.sea_surface import SeaSurface
-    from mitransient_lidar.rendering.shots.batches import ShotPoses
-    from mitransient_lidar.transport.medium.water import Water
-    from mitransient_lidar.transport.plugin_types import Transmitter
-    from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.medium.water import Water
+from mitransient_lidar.transport.medium.water_phases import table_of
+from mitransient_lidar.transport.plugin_types import Transmitter
+from mitransient_lidar.transport.probe import axis_on_bottom, first_along
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import seas_of
 
 #: Reach of the mean over the beam's footprint, in its standard deviations, and smallest number of cells in one of them.
 _REACH, _FEWEST_CELLS = 4.5, 4
@@ -133,8 +133,6 @@ class SeaMap:
 
 def transmitter_of(scene: mi.Scene) -> Transmitter:
     """Return the transmitter of a scene; raise UserError without one."""
-    from mitransient_lidar.transport.plugin_types import Transmitter
-
     transmitter = next((emitter for emitter in scene.emitters() if isinstance(emitter, Transmitter)), None)
     if transmitter is None:
         raise UserError("the scene needs a lidar_transmitter and a multipixel_receiver to find shots for")
@@ -155,8 +153,6 @@ def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPose
     (`water_means`). Where the axis meets land or another solid above the sea, the sea and the water are unknown (NaN).
     The bottom below another solid is also unknown; land is a bottom above the sea, at a negative depth.
     """
-    from mitransient_lidar.transport.probe import axis_on_bottom, first_along
-
     places = shots.places
     turns = np.zeros(len(places))
     if shots.in_scene is not None:
@@ -201,8 +197,6 @@ def water_means(water: Water, depth: FloatArray) -> dict[str, FloatArray]:
     formula in `water_types.InherentProperties.kd`. At an unknown depth (NaN) the values are given for a water that is
     the same at all depths, and NaN for others.
     """
-    from mitransient_lidar.transport.medium.water_phases import table_of
-
     column = water.column
     phases = water.phases.phases[: column.count]
     ratios = {id(phase): table_of(phase).backscatter_ratio for phase in phases}
@@ -226,8 +220,6 @@ def solids_below(lidar: LidarScene, x: FloatArray, y: FloatArray) -> tuple[Float
 
     Places in the scene have the shape (n,); targets are `WaterScene.targets`.
     """
-    from mitransient_lidar.transport.probe import first_along
-
     heights = [float(z) for solid in lidar.solids for z in (solid.bbox().min.z, solid.bbox().max.z)]
     places = np.stack([x, y], axis=1) - lidar.frame_origin[:2]
     line = [np.insert(places, 2, z, axis=1) for z in (max(heights, default=0.0) + 1, min(heights, default=0.0) - 1)]
@@ -237,8 +229,6 @@ def solids_below(lidar: LidarScene, x: FloatArray, y: FloatArray) -> tuple[Float
 
 def sea_of(scene: mi.Scene) -> SeaSurface | None:
     """Return the sea of an ``ocean_surface``, None without one."""
-    from mitransient_lidar.transport.scene_parts import seas_of
-
     return next((found.sea for found in seas_of(scene)), None)
 
 

@@ -66,10 +66,7 @@ class LightMaps:
     Cells are counted from where the transmitter's axis, refracted by a level sea, meets the plane. Energies are kept
     relative to the absorption along the receiver's axis, with and without those that scattering turns.
 
-    Parameters
-    ----------
-    scene
-        Scene of one or several shots.
+    `scene`: scene of one or several shots.
     """
 
     def __init__(self, scene: LidarScene, planes: Planes, shots: int) -> None:

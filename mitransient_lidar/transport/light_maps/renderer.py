@@ -19,6 +19,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.lidar.level_sea import refract_level
+from mitransient_lidar.physics.sea.shoaling import ShoalingHeights
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.two_way_spread import TwoWaySpread
@@ -30,7 +31,7 @@ from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, 
 from mitransient_lidar.transport.paths.refracted_connection import StraightConnection
 from mitransient_lidar.transport.paths.ripple_focusing import Echo
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.probe import Rays
+from mitransient_lidar.transport.probe import Rays, first_along
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.solids import box_of, met_shape, scene_of_shapes
@@ -68,6 +69,12 @@ _SHADOWED, _DEFLECTED = 0.1, 0.05
 
 #: Largest slope of a bottom on which displaced light arrives at another depth: steeper ones are sides.
 _STEEPEST = 1.0
+
+#: Least depth of the bottom below a beam [m], and rays of the beam that must reach it.
+_LEAST_DEPTH, _RAYS_TO_BED = 0.05, 64
+
+#: Reason against the light of shots over land, or over solids near the surface.
+REACH_THE_SURFACE = "solids reach the surface"
 
 #: Distance beyond all waves that focus light [m].
 _FAR = 1e3
@@ -127,10 +134,7 @@ class LightMapRenderer(PassRenderer):
 
     Paths that change more than once between down and up are left out, and the shadows of solids in the beam.
 
-    Parameters
-    ----------
-    level
-        Whether the sea is level, with all of its slopes as ripples, as the mean over seas.
+    `level`: whether the sea is level, with all of its slopes as ripples, as the mean over seas.
 
     Raises
     ------
@@ -139,7 +143,8 @@ class LightMapRenderer(PassRenderer):
     """
 
     def __init__(self, scene: LidarScene, classes: PathClasses, *, level: bool = False) -> None:
-        if (reason := unsuited(scene)) is not None:
+        reason = unsuited(scene) or (level and scene.has_dry_solids and REACH_THE_SURFACE)
+        if reason:
             raise UnsuitedError(f"light maps do not suit the scene: {reason}")
         water, axis = scene.required_water, scene.receiver.pose.axis
         cos_water = -float(refract_level(axis, scene.refractive_index)[2])
@@ -338,7 +343,7 @@ def _spread_of(
 
 
 def unsuited(scene: LidarScene) -> str | None:
-    """Return why light maps are not for a scene, or None."""
+    """Return why light maps are not for a scene, or None. Shots must also be `over_water`."""
     if scene.submerged:
         return "the lidar is under water"
     if scene.water is None or len(scene.surfaces) != 1 or len(scene.seas) != 1:
@@ -354,8 +359,8 @@ def unsuited(scene: LidarScene) -> str | None:
         return "its water has bubbles"
     if scene.perturbations.count:
         return "derivatives need paths"
-    if scene.has_veils or scene.has_shared_gaps or scene.has_specular_or_dry_solids:
-        return "solids are transparent, mirror-like, or reach the surface"
+    if scene.has_veils or scene.has_shared_gaps or scene.has_specular_solids:
+        return "solids are transparent or mirror-like"
     events = _events(scene)
     apart = (
         np.linalg.norm(scene.receiver.pose.origin - scene.transmitter.pose.origin) / scene.receiver.pose.ground_range
@@ -367,20 +372,44 @@ def unsuited(scene: LidarScene) -> str | None:
     return None
 
 
+def over_water(scene: LidarScene, places: FloatArray, turns: FloatArray | None) -> BoolArray:
+    """Return which shots have solids below the sea alone in their beam, shape (shots,); arguments as `light_faintly`.
+
+    Rays of the beam, its outermost among them, pass the sea without meeting a solid, down to 0.05 m or, where waves do
+    not follow the bottom, to the lowest trough.
+    """
+    wet = np.ones(len(places), dtype=bool)
+    if not scene.has_dry_solids:
+        return wet
+    follows = isinstance(scene.seas[0].sea.waves, ShoalingHeights)
+    lowest = 0.0 if follows or scene.sea_heights is None else scene.sea_heights[0]
+    rays, pose = Rays.of_beam(scene, scene.transmitter), scene.transmitter.pose
+    start, end = (
+        (pose.origin + rays.directions * ((z - pose.origin[2]) / rays.directions[:, 2:]) - pose.ground_point())
+        for z in (pose.origin[2], min(lowest, -_LEAST_DEPTH))
+    )
+    outermost = np.argsort(-np.linalg.norm(end - end.mean(axis=0), axis=1))[: _RAYS_TO_BED // 2]
+    some = np.concatenate([outermost, np.linspace(0, len(end) - 1, _RAYS_TO_BED // 2).astype(np.intp)])
+    turned = np.ones(len(places), dtype=complex) if turns is None else turns @ [1, 1j]
+
+    def among_solids(points: FloatArray) -> FloatArray:
+        away = np.multiply.outer(turned, points[some, :2] @ [1, 1j])
+        level = np.stack([away.real, away.imag], axis=-1) + places[:, np.newaxis]
+        return np.insert(level.reshape(-1, 2), 2, np.tile(points[some, 2], len(places)), axis=1)
+
+    met = first_along(scene, scene.solids, [among_solids(start), among_solids(end)])[:, 2]
+    return np.asarray(np.isnan(met).reshape(len(places), -1).all(axis=1))
+
+
 def light_faintly(scene: LidarScene, target: mi.Shape, places: FloatArray, turns: FloatArray | None) -> BoolArray:
     """Return which shots light a target so faintly that its shadow needs no merging, shape (shots,).
 
     In each pixel at most `_SHADOWED` of the beam over a level sea meets the box of the target, widened as waves deflect
     the light.
 
-    Parameters
-    ----------
-    scene, target
-        The lidar's scene, and a target of it.
-    places
-        Points (x, y) of the shots among the shapes [m], shape (shots, 2).
-    turns
-        Cosine and sine of their rotations about the vertical, shape (shots, 2); None without any.
+    `scene`, `target`: the lidar's scene, and a target of it. `places`: points (x, y) of the shots among the shapes [m],
+    shape (shots, 2). `turns`: cosine and sine of their rotations about the vertical, shape (shots, 2); None without
+    any.
     """
     low, high = box_of(target)
     rays = Rays.of_beam(scene, scene.transmitter)

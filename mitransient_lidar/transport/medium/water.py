@@ -99,14 +99,8 @@ def coinciding(length: mi.Float) -> mi.Float:
 def refract(direction: mi.Vector3f, normal: mi.Normal3f, eta: mi.Float | float) -> mi.Vector3f:
     """Refract at a facet: return the unit direction, beyond the facet, from which light arrives at it.
 
-    Parameters
-    ----------
-    direction
-        Unit direction from the facet to the light source, on the side of the normal.
-    normal
-        Unit normal of the facet.
-    eta
-        Refractive index on the side of the normal over the index beyond, at most 1.
+    `direction`: unit direction from the facet to the light source, on the side of the normal. `normal`: unit normal of
+    the facet. `eta`: refractive index on the side of the normal over the index beyond, at most 1.
     """
     cosine = dr.dot(direction, normal)
     root = dr.safe_sqrt(1 - eta * eta * (1 - cosine * cosine))

@@ -195,14 +195,8 @@ class _Grid:
 class SurfaceHeights:
     """Heights of the sea surface where it is lit or seen, and of the first solids below the surface there.
 
-    Parameters
-    ----------
-    region
-        Sea region.
-    depth
-        Largest depth of light [m]: solids are also found beside the region, where light at that depth is.
-    moves
-        Region displacements (x, y) per shot [m], shape (shots, 2).
+    `region`: sea region. `depth`: largest depth of light [m]: solids are also found beside the region, where light at
+    that depth is. `moves`: region displacements (x, y) per shot [m], shape (shots, 2).
     """
 
     OF_SHOTS = ("_surface", "_bed", "_veil")

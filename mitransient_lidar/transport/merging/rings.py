@@ -42,14 +42,8 @@ def cell_widths(given: float, spread: float, attenuation: float) -> tuple[float,
 
     Raises UserError if the beam is too wide for automatic cells.
 
-    Parameters
-    ----------
-    given
-        Width on the axis at the surface [m]; 0 for an automatic one, which then is 0.
-    spread
-        Beam standard deviation there [m].
-    attenuation
-        Beam attenuation of the water [1/m].
+    `given`: width on the axis at the surface [m]; 0 for an automatic one, which then is 0. `spread`: beam standard
+    deviation there [m]. `attenuation`: beam attenuation of the water [1/m].
     """
     core = CORE_PER_SPREAD * spread
     if given:

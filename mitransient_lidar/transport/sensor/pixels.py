@@ -372,14 +372,8 @@ class HexPixels(PixelArray):
     The array without its central hexagon is three parallelograms of n x (n + 1) hexagons for n rings. Points are drawn
     in these and assigned to hexagons afterwards, at a cost that does not depend on N.
 
-    Parameters
-    ----------
-    layout
-        ``hexN`` with N = 1, 7, 19, 37, ... hexagons.
-    field_of_view
-        Circle diameter [rad], positive.
-    fill_factor
-        Share of each hexagon that receives light, 0.01 to 1: a smaller hexagon about the same centre.
+    `layout`: ``hexN`` with N = 1, 7, 19, 37, ... hexagons. `field_of_view`: circle diameter [rad], positive.
+    `fill_factor`: share of each hexagon that receives light, 0.01 to 1: a smaller hexagon about the same centre.
 
     Notes
     -----
