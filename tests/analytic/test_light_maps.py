@@ -128,6 +128,29 @@ def test_shots_that_light_a_target_are_merged():
 
 
 @pytest.mark.slow
+def test_vertical_sides_keep_scattered_light():
+    """A cube of 3 m in turbid water, seen at 30 degrees from nadir: without light on its sides it has 0.76 of its own.
+
+    Its sides get less scattered light than they should: 0.93 of the whole.
+    """
+    params = {
+        **{"spectrum": "flat", "layout": "1x1", "off_nadir_deg": 30, "field_of_view_mrad": 60, "aim_x": -2.6},
+        **{"cube_size": 3, "cube_x": 0, "cube_y": 0, "cube_depth": 2, "bottom_depth": 6, "bottom_ripple_height": 0},
+        **{"bottom_slope_x_deg": 0, "bottom_slope_y_deg": 0},
+        **{"attenuation": 0.6, "scattering": 0.45, "backscattering": 0.009},
+    }
+    lidar, session = lidar_of(params, "flight")
+    merging = session.scene.integrator().prepare(session.scene, session.sensor).by_origin()
+    maps = LightMapRenderer(lidar, PathClasses()).by_origin().scaled(8)
+    of_cube = [
+        np.array([renderer.render_pass(seed).histogram.energy()[..., 3, :].sum() for seed in range(8)])
+        for renderer in (maps, merging)
+    ]
+    assert maps.classes.names[3] == "cube"
+    significance.assert_same(*(energy[:, np.newaxis] for energy in of_cube), error=0.03, bias=0.1)
+
+
+@pytest.mark.slow
 def test_shots_over_land_are_merged():
     """The water line of `beach` is at x = 1.4 m, and 5 cm deep water at 0.7 m; half of the beam is 4 m long."""
     places = np.array([[-30.0, 0.0], [-6.0, 8.0], [0.0, 0.0], [4.0, 0.0], [30.0, 0.0]])
