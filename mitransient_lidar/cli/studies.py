@@ -220,7 +220,7 @@ def _tpu(
     [cm] and the fits.
     """
     from mitransient_lidar.analysis.depth_uncertainty import write_fits
-    from mitransient_lidar.loading.instruments import read_instrument
+    from mitransient_lidar.loading.catalogue import read_instrument
     from mitransient_lidar.plots.studies.depths import plot_orders, plot_uncertainty
     from mitransient_lidar.studies.depth_bias import describe_tpu
 

@@ -20,9 +20,9 @@ from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.document import read_document
-from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.parameters import plugins_of
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.axis_limits import system_attenuation
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.water.water_types import InherentProperties

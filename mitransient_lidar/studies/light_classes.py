@@ -10,8 +10,8 @@ import xarray as xr
 
 from mitransient_lidar.core.options import FewerPasses, Instrument, Option, Scene, Seed, checked
 from mitransient_lidar.core.tables.written import table_lines
-from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accumulators import PassAccumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.files import together
 from mitransient_lidar.core.options import Option, checked, positive_option
-from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication import drawings, waveforms
 from mitransient_lidar.rendering.passes import ProgressCallback
