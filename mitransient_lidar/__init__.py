@@ -82,8 +82,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.fit import fit
     from mitransient_lidar.studies.forecast import forecast
-    from mitransient_lidar.studies.fov_sweep import fov_sweep
-    from mitransient_lidar.studies.light_classes import estimate, scattering_orders
+    from mitransient_lidar.studies.light_classes import estimate, fov_sweep, scattering_orders
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
@@ -102,7 +101,7 @@ _FUNCTIONS = {
     "fit": ("studies.fit", "fit"),
     "fly": ("flights.fly", "fly"),
     "forecast": ("studies.forecast", "forecast"),
-    "fov_sweep": ("studies.fov_sweep", "fov_sweep"),
+    "fov_sweep": ("studies.light_classes", "fov_sweep"),
     "instrument_names": ("loading.catalogue", "instrument_names"),
     "kelvin_wake": ("physics.sea.kelvin_wake", "kelvin_wake"),
     "open_scene": ("loading.scenes", "open_scene"),

@@ -130,7 +130,7 @@ _study(
 )
 _study(
     _LIGHT,
-    "studies.fov_sweep:fov_sweep",
+    "studies.light_classes:fov_sweep",
     "studies.light:plot_fov_sweep",
     "describe_fov_sweep",
     "table1 --fov-mrad 5,20,80",
