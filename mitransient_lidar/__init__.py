@@ -64,8 +64,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.analysis.waveforms.echo_table import extract as echoes
     from mitransient_lidar.campaigns.sweep import campaign
     from mitransient_lidar.flights.fly import fly
-    from mitransient_lidar.loading.catalogue import scene_names, scene_parameters
-    from mitransient_lidar.loading.instruments import instrument_names, read_instrument
+    from mitransient_lidar.loading.catalogue import instrument_names, read_instrument, scene_names, scene_parameters
     from mitransient_lidar.loading.scenes import open_scene
     from mitransient_lidar.physics.lidar.gate_train import GateTrain
     from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
@@ -83,8 +82,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.fit import fit
     from mitransient_lidar.studies.forecast import forecast
-    from mitransient_lidar.studies.fov_sweep import fov_sweep
-    from mitransient_lidar.studies.light_classes import estimate, scattering_orders
+    from mitransient_lidar.studies.light_classes import estimate, fov_sweep, scattering_orders
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
@@ -103,11 +101,11 @@ _FUNCTIONS = {
     "fit": ("studies.fit", "fit"),
     "fly": ("flights.fly", "fly"),
     "forecast": ("studies.forecast", "forecast"),
-    "fov_sweep": ("studies.fov_sweep", "fov_sweep"),
-    "instrument_names": ("loading.instruments", "instrument_names"),
+    "fov_sweep": ("studies.light_classes", "fov_sweep"),
+    "instrument_names": ("loading.catalogue", "instrument_names"),
     "kelvin_wake": ("physics.sea.kelvin_wake", "kelvin_wake"),
     "open_scene": ("loading.scenes", "open_scene"),
-    "read_instrument": ("loading.instruments", "read_instrument"),
+    "read_instrument": ("loading.catalogue", "read_instrument"),
     "read_profile": ("physics.water.profiles", "read_profile"),
     "record": ("analysis.receiver", "detect_waveforms"),
     "render": ("rendering.render", "render"),

@@ -12,8 +12,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries
-from mitransient_lidar.physics.sea.foam import foam_whiteness
+from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, foam_whiteness
 from mitransient_lidar.physics.sea.sea_mesh import SIZE_MARGIN, Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface, followed_depths
 from mitransient_lidar.physics.sea.shoaling import BottomDepths, ShoalingHeights

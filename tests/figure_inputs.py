@@ -16,9 +16,8 @@ from mitransient_lidar.physics.water.profiles import Profile
 from mitransient_lidar.physics.water.seawater import water_phase_function
 from mitransient_lidar.plots.campaigns import plot_campaign
 from mitransient_lidar.plots.gates.echoes import plot_depths
-from mitransient_lidar.plots.gates.images import plot_gates
+from mitransient_lidar.plots.gates.images import plot_gates, plot_passive
 from mitransient_lidar.plots.layout import plot_layout
-from mitransient_lidar.plots.passive import plot_passive
 from mitransient_lidar.plots.studies.depths import plot_depth_bias, plot_forecast, plot_orders, plot_uncertainty
 from mitransient_lidar.plots.studies.light import plot_fov_sweep, plot_scattering_orders
 from mitransient_lidar.plots.studies.parameters import plot_fit

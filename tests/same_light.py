@@ -27,7 +27,7 @@ import numpy as np
 import xarray
 
 from mitransient_lidar.loading import catalogue
-from mitransient_lidar.loading.instruments import instrument_names
+from mitransient_lidar.loading.catalogue import instrument_names
 from mitransient_lidar.rendering.passive import render_passive
 
 #: Attributes that may differ: of the machine, and those that hold whole scenes.

@@ -9,7 +9,7 @@ from pathlib import Path
 from generated import remove_others, table, write
 from sphinx.application import Sphinx
 
-from mitransient_lidar.loading import catalogue, instruments
+from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.document import read_document
 
 _SCENES = """\
@@ -39,7 +39,7 @@ def _write(sphinx: Sphinx) -> None:
     scenes = {name: _scene(name) for name in catalogue.scene_names()}
     summaries = {name: catalogue.scene_summary(name) for name in scenes}
     _write_pages(reference / "scenes", _SCENES, scenes, summaries)
-    known = {name: instruments.read_instrument(name) for name in instruments.instrument_names()}
+    known = {name: catalogue.read_instrument(name) for name in catalogue.instrument_names()}
     titles = {name: instrument.title for name, instrument in known.items()}
     _write_pages(reference / "instruments", _INSTRUMENTS, {n: _instrument(one) for n, one in known.items()}, titles)
 
@@ -74,7 +74,7 @@ def _scene(name: str) -> str:
     )
 
 
-def _instrument(one: instruments.Instrument) -> str:
+def _instrument(one: catalogue.Instrument) -> str:
     """Return the page of an instrument: sources, parameters and the file of its receiver."""
     rows = [(f"`{parameter.name}`", f"`{parameter.value}`", _plain(parameter.source)) for parameter in one.parameters]
     return "\n".join(
@@ -82,8 +82,8 @@ def _instrument(one: instruments.Instrument) -> str:
             f"# {one.name}\n\n{_plain(one.title)}.\n\nChannels: {', '.join(one.channels)}.\n",
             f"{_list_of_sources(one.description)}\n",
             f"## Parameters\n\n{table(('name', 'value', ''), [row for row in rows if row[1] != '``'], 'parameters')}",
-            f"## Receiver\n\nTaken by `record`:\n\n```toml\n{instruments.receiver_text(one.name)}```\n",
-            f"## XML\n\n```xml\n{instruments.instrument_text(one.name)}```\n",
+            f"## Receiver\n\nTaken by `record`:\n\n```toml\n{catalogue.receiver_text(one.name)}```\n",
+            f"## XML\n\n```xml\n{catalogue.instrument_text(one.name)}```\n",
         ]
     )
 

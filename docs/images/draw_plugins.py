@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 from plugin_pages import DAYLIGHT, PASSES, RIPPLES, Plugin, example, plugins
 
-from mitransient_lidar.plots.passive import plot_passive
+from mitransient_lidar.plots.gates.images import plot_passive
 from mitransient_lidar.plots.water import plot_phase_function
 from mitransient_lidar.plots.waveforms import plot_waveforms
 from mitransient_lidar.rendering.passive import render_passive

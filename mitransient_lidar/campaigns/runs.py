@@ -14,13 +14,12 @@ import xarray as xr
 from mitransient_lidar.campaigns.design import Campaign, Column
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import unit_of
-from mitransient_lidar.loading.catalogue import scene_path
+from mitransient_lidar.loading.catalogue import mount, scene_path
 from mitransient_lidar.loading.document import SceneDocument, read_document
-from mitransient_lidar.loading.exclusive import alone
-from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_known, values_of
 from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import open_scene, read_source
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE
 from mitransient_lidar.rendering.shots.series import render_shots

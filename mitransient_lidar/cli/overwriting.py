@@ -269,10 +269,10 @@ def _mark_of_result(path: Path) -> dict[str, Any] | None:
     if not _is_result(path) or not path.is_file():
         return None
     from mitransient_lidar.rendering import again
-    from mitransient_lidar.results import netcdf
+    from mitransient_lidar.results.files import check_sum
 
     try:
-        if path.suffix.lower() == ".nc" and not netcdf.check_sum(path):
+        if path.suffix.lower() == ".nc" and not check_sum(path):
             return None  # from another program, which may have kept the attributes
         attributes = again.read_attributes(path)
         command = again.result_kind(attributes)

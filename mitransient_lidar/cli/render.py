@@ -222,12 +222,12 @@ def _passive(
     suffixes = [".nc", ".exr", *([".png"] if plot else []), *([".gif"] if plot and is_animation else [])]
     targets = [output / f"{name}_passive{suffix}" for suffix in suffixes]
     check_targets(output, targets, scene)
-    from mitransient_lidar.plots import passive as passive_plots
+    from mitransient_lidar.plots.gates.images import animate_passive, plot_passive
     from mitransient_lidar.results import save
 
     with DeferredInterrupt(at_once=False):
         image = _again(call)()
-        writers: dict[str, Any] = {".gif": passive_plots.animate_passive, ".png": passive_plots.plot_passive}
+        writers: dict[str, Any] = {".gif": animate_passive, ".png": plot_passive}
         with announced(output):
             for target in targets:
                 if target.suffix != ".gif" or "row" in image.dims:

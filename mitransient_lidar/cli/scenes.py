@@ -77,7 +77,7 @@ def _instruments(
     Parameters that are not published are assumed, and listed as such; those of the receiver follow, as the TOML
     file that record takes. Use with render SCENE --instrument NAME.
     """
-    from mitransient_lidar.loading import instruments as shipped
+    from mitransient_lidar.loading import catalogue as shipped
 
     if name is None:
         if xml:

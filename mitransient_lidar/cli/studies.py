@@ -130,7 +130,7 @@ _study(
 )
 _study(
     _LIGHT,
-    "studies.fov_sweep:fov_sweep",
+    "studies.light_classes:fov_sweep",
     "studies.light:plot_fov_sweep",
     "describe_fov_sweep",
     "table1 --fov-mrad 5,20,80",
@@ -220,7 +220,7 @@ def _tpu(
     [cm] and the fits.
     """
     from mitransient_lidar.analysis.depth_uncertainty import write_fits
-    from mitransient_lidar.loading.instruments import read_instrument
+    from mitransient_lidar.loading.catalogue import read_instrument
     from mitransient_lidar.plots.studies.depths import plot_orders, plot_uncertainty
     from mitransient_lidar.studies.depth_bias import describe_tpu
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import html
+import importlib
 import inspect
 import math
 import re
+import sys
 import textwrap
+import time
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import (
     Annotated,
@@ -28,7 +34,6 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.documents import check_keys, required, table
-from mitransient_lidar.core.progress import progress_of
 from mitransient_lidar.core.validation import (
     FloatArray,
     finite_array,
@@ -38,6 +43,48 @@ from mitransient_lidar.core.validation import (
     relative_error,
     shown,
 )
+
+#: Shortest time between two states that are shown [s].
+_INTERVAL_S = 0.2
+
+#: Whether a public function runs: of one that calls others, the notebook shows the whole alone.
+_running: ContextVar[bool] = ContextVar("running", default=False)
+
+
+@contextlib.contextmanager
+def progress_of(given: Callable[[Any], None] | None) -> Iterator[Callable[[Any], None] | None]:
+    """Yield the function that takes the progress of a call: the given one, or one that shows it in a notebook.
+
+    It is None outside notebooks. The states have ``done``, ``planned`` (None if unknown), and a text. IPython's display
+    needs no widgets, unlike the bars of rich and tqdm; it is removed when the call ends.
+    """
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    shown = given is None and hasattr(shell, "kernel") and not _running.get()
+    token = _running.set(True)
+    try:
+        with _bar() if shown else contextlib.nullcontext(given) as show:
+            yield show
+    finally:
+        _running.reset(token)
+
+
+@contextlib.contextmanager
+def _bar() -> Iterator[Callable[[Any], None]]:
+    """Show the latest state as a bar with its text."""
+    display: Any = importlib.import_module("IPython.display")
+    handle, latest = display.display(display.HTML("preparing"), display_id=True), [0.0]
+
+    def show(state: Any) -> None:
+        if (now := time.monotonic()) - latest[0] >= _INTERVAL_S:
+            latest[0] = now
+            share = "" if state.planned is None else f' value="{state.done}" max="{state.planned}"'
+            handle.update(display.HTML(f"<progress{share}></progress> {html.escape(str(state))}"))
+
+    try:
+        yield show
+    finally:
+        handle.update(display.HTML(""))
+
 
 #: Annotations as texts that may have an `Option`.
 _MAY_HAVE = re.compile(r"\w+$|Annotated\[")

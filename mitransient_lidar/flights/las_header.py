@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.maps.coordinate_systems import map_system, parsed_system
+from mitransient_lidar.core.maps import map_system, parsed_system
 
 if TYPE_CHECKING:
     import laspy

@@ -17,7 +17,7 @@ from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.formats.documents import parse_toml
-from mitransient_lidar.core.maps.coordinate_systems import MapSystem, map_system
+from mitransient_lidar.core.maps import MapSystem, map_system
 from mitransient_lidar.core.options import Option, Plan, one_of, positive_option
 from mitransient_lidar.core.validation import FloatArray, shown
 from mitransient_lidar.flights.las_header import check_same_system
@@ -25,7 +25,7 @@ from mitransient_lidar.flights.poses.mounting import Mounting, PulsePoses, pulse
 from mitransient_lidar.flights.poses.platforms import XYZ, Platform, SbetFile, TrajectoryFile, platform_of
 from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.refracted_paths import PoseErrors
-from mitransient_lidar.loading.instruments import with_infrared
+from mitransient_lidar.loading.catalogue import with_infrared
 from mitransient_lidar.physics.receiver.receiver_files import Setting
 from mitransient_lidar.rendering.passes import LIGHT, LightOption
 from mitransient_lidar.results.attributes import PointClass

@@ -25,7 +25,7 @@ from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
 from mitransient_lidar.flights.positions import ECHOES, IN_AIR, fit_surface, numbered_returns, positions
 from mitransient_lidar.flights.preparation import beyond_angles
-from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.level_sea import cos_in_water
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.results.attributes import PointClass, described, flagged, label

@@ -44,9 +44,9 @@ from mitransient_lidar.flights.recording import (
     saturated_pulses,
 )
 from mitransient_lidar.loading import variants
-from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import read_source
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.results.attributes import described, join

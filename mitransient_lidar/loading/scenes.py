@@ -17,14 +17,13 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import variants
-from mitransient_lidar.loading.catalogue import scene_path
+from mitransient_lidar.loading.catalogue import mount, scene_path
 from mitransient_lidar.loading.checks import check, check_dict
 from mitransient_lidar.loading.document import DOLLAR, SceneDocument, read_document
-from mitransient_lidar.loading.exclusive import alone_with_scene
 from mitransient_lidar.loading.frame import move_to_aim
-from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_params, fill, unknown_parameters, values_of
 from mitransient_lidar.loading.scene_source import SceneSource, plugin_values
+from mitransient_lidar.loading.variants import alone_with_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.height_maps import IN_MAP_COORDINATES
 from mitransient_lidar.transport.daylight.renderer import DaylightIntegrator
@@ -104,7 +103,7 @@ def open_scene(
         Values for the parameters of an XML scene, its own (``<default>``) and its plugins', as in
         `loading.parameters.fill`, and of the instrument.
     instrument
-        Name of the instrument whose laser and receiver replace an XML scene's; see `instruments.mount`.
+        Name of the instrument whose laser and receiver replace an XML scene's; see `catalogue.mount`.
     variant
         Mitsuba variant, as for `variants.set_variant`.
     model

@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.sea.sea_mesh import grid_faces
 from mitransient_lidar.rendering.describe import SAMPLED_TICKS, surface_points

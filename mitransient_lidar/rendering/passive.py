@@ -17,9 +17,9 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, SceneOrResult, Sensor, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray, require_memory, shown
 from mitransient_lidar.loading import catalogue
-from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.clear_sky import background_power
 from mitransient_lidar.rendering.accuracy import PassStatistics, RatioStatistics, smoothing_bias
 from mitransient_lidar.rendering.passes import (

@@ -12,9 +12,9 @@ import mitsuba as mi
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Infrared, Instrument, Option, SceneOrResult, Sensor, checked
-from mitransient_lidar.loading.exclusive import alone
-from mitransient_lidar.loading.instruments import with_infrared
+from mitransient_lidar.loading.catalogue import with_infrared
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator, share_of_pass
 from mitransient_lidar.rendering.accuracy import ErrorWindow
@@ -96,7 +96,7 @@ def render(
         Values for the parameters of an XML scene and of its plugins; they have priority over an instrument's.
     infrared
         Whether to also render the instrument's infrared channel, at the same place; it takes a render of its own. See
-        `loading.instruments.with_infrared` for the parameters, and `results.attributes`.
+        `loading.catalogue.with_infrared` for the parameters, and `results.attributes`.
     integrator
         Name or dict of an integrator plugin, or an integrator; by default the scene's.
     target_error

@@ -14,8 +14,8 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import FewerPasses, Instrument, Numbers, Option, Scene, Seed, checked
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes
 from mitransient_lidar.results.attributes import label

@@ -23,10 +23,9 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
-from mitransient_lidar.loading.catalogue import scene_text
-from mitransient_lidar.loading.exclusive import alone
-from mitransient_lidar.loading.instruments import instrument_names
+from mitransient_lidar.loading.catalogue import instrument_names, scene_text
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.transport.paths.passes import PassRenderer
 from mitransient_lidar.transport.rng import pass_streams

@@ -27,8 +27,8 @@ from mitransient_lidar.core.options import (
 )
 from mitransient_lidar.core.tables.written import table_lines, write_csv
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
 from mitransient_lidar.rendering.render import render

@@ -30,7 +30,7 @@ from mitransient_lidar.core.options import RECEIVERS, Infrared, Numbers, Option,
 from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, finite
-from mitransient_lidar.loading.instruments import read_instrument
+from mitransient_lidar.loading.catalogue import read_instrument
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.attributes import described, label

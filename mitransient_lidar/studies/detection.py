@@ -31,8 +31,8 @@ from mitransient_lidar.core.options import (
     positive_option,
 )
 from mitransient_lidar.core.validation import in_range, require_memory, shown
-from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.camera import Camera

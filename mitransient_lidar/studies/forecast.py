@@ -34,14 +34,14 @@ from mitransient_lidar.analysis.waveforms.echo_table import extract
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.formats.array_files import readable_suffix
-from mitransient_lidar.core.maps.grids import read_geotiff, write_geotiff
+from mitransient_lidar.core.maps import read_geotiff, write_geotiff
 from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, positive
-from mitransient_lidar.loading.exclusive import alone
-from mitransient_lidar.loading.instruments import read_instrument
+from mitransient_lidar.loading.catalogue import read_instrument
 from mitransient_lidar.loading.scenes import open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.rendering.passes import ProgressCallback

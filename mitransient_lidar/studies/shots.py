@@ -17,8 +17,8 @@ from mitransient_lidar.core.options import Option, Scene, checked, positive_opti
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading import variants
-from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.series import render_shots

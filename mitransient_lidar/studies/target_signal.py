@@ -15,8 +15,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Instrument, Option, Scene, TargetId, checked, positive_option
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accumulators import PassAccumulator

@@ -11,7 +11,7 @@ from oracles.column_slope import effective_attenuation
 from significance import largest_z
 
 import mitransient_lidar
-from mitransient_lidar.studies.fov_sweep import fov_sweep
+from mitransient_lidar.studies.light_classes import fov_sweep
 
 pytestmark = pytest.mark.long
 

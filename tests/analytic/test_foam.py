@@ -11,8 +11,7 @@ from significance import assert_equal, largest_z, mean_and_error
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.lidar.level_sea import LidarSystem
-from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.foam import LAWS, foam_cover, foam_whiteness
+from mitransient_lidar.physics.sea.cox_munk import LAWS, cox_munk, foam_cover, foam_whiteness
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.physics.sea.shoaling import BottomDepths
 from mitransient_lidar.physics.water.layers import WaterColumn

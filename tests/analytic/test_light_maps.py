@@ -17,7 +17,7 @@ from mitransient_lidar.flights.renderer import FlightRenderer
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.rendering.shots.batches import ShotPoses, suits_maps
 from mitransient_lidar.rendering.shots.scene import ShotScene
-from mitransient_lidar.transport.light_maps.heights import HeightFields
+from mitransient_lidar.transport.light_maps.maps import HeightFields
 from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
 from mitransient_lidar.transport.paths.passes import PathClasses
 from mitransient_lidar.transport.probe import Probe

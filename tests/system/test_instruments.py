@@ -11,7 +11,7 @@ from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.echo_classes import EchoClass
 from mitransient_lidar.analysis.waveforms.echo_table import extract
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.loading import instruments
+from mitransient_lidar.loading import catalogue
 from mitransient_lidar.results.attributes import split
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
@@ -21,7 +21,7 @@ STEADY = {"type": "lidar_merging", "paths_per_pass": 8192, "photons_per_pass": 8
 
 def record(name):
     """Return parameters of a record that begins before the surface echo of the scene table1 and ends below 8 m."""
-    given = {each.name: each.value for each in instruments.read_instrument(name).parameters}
+    given = {each.name: each.value for each in catalogue.read_instrument(name).parameters}
     altitude, angle = float(given["altitude"]), np.radians(float(given["off_nadir_deg"]))
     # The footprint of the mast's beam is 16 m long.
     before, length = (90, 300) if name == "published_mast" else (40, 170)
@@ -47,7 +47,7 @@ KINDS = ("published_mast", "icesat2_atlas", "riegl_vq840g", "teledyne_czmil", "r
     "name",
     [
         pytest.param(name, marks=pytest.mark.slow if name in KINDS else pytest.mark.long)
-        for name in instruments.instrument_names()
+        for name in catalogue.instrument_names()
     ],
 )
 def test_every_instrument_renders(name):
@@ -55,7 +55,7 @@ def test_every_instrument_renders(name):
     scene = OWN.get(name, "table1")
     result = few(scene, STEADY, instrument=name, params=record(name))
     assert result.attrs["instrument"] == name
-    assert tuple(result["pixel"].values) == instruments.read_instrument(name).channels
+    assert tuple(result["pixel"].values) == catalogue.read_instrument(name).channels
     assert np.isfinite(result["waveform"]).all()
     energy = result["impulse_response"]
     assert (energy.sum("time") > 0).all()

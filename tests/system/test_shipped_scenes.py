@@ -9,7 +9,7 @@ from same_bits import assert_same_bits
 
 import mitransient_lidar
 from mitransient_lidar import results
-from mitransient_lidar.loading import catalogue, instruments, scenes
+from mitransient_lidar.loading import catalogue, scenes
 from mitransient_lidar.results import sum_errors
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
@@ -72,7 +72,7 @@ def test_scene(name, tmp_path, caplog):
     # Its lidar may be another one.
     opened = scenes.open_scene(name, instrument="riegl_vq840g")
     mounted, parameters = opened.scene, opened.parameters
-    assert mounted.sensors()[0].receiver.pixels.names == list(instruments.read_instrument("riegl_vq840g").channels)
+    assert mounted.sensors()[0].receiver.pixels.names == list(catalogue.read_instrument("riegl_vq840g").channels)
     assert parameters["altitude"] == "150"
 
 

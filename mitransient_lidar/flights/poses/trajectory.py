@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import open_file
 from mitransient_lidar.core.formats.array_files import check_size
-from mitransient_lidar.core.maps.coordinate_systems import (
+from mitransient_lidar.core.maps import (
     LARGEST_DISTORTION,
     distortions,
     is_east_north,
@@ -23,7 +23,7 @@ from mitransient_lidar.core.maps.coordinate_systems import (
 )
 from mitransient_lidar.core.options import one_of
 from mitransient_lidar.core.tables.headings import METRES, Column, Heading, read_headings
-from mitransient_lidar.core.tables.long_tables import read_head, read_long_table
+from mitransient_lidar.core.tables.text_tables import read_head, read_long_table
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, integer, positive, shown
 from mitransient_lidar.flights.poses.records import PlatformPoses, RotationSpec, check_records, rotation_matrices
 
@@ -48,7 +48,7 @@ _SBET_NUMBERS, _LARGEST_SBET = 17, 2**30
 def read_text_records(path: str | os.PathLike[str]) -> PlatformPoses:
     """Read a trajectory from a text file as HELIOS++ does.
 
-    Each line is a record: time [s], roll, pitch, yaw [deg], x, y, z [m], as `long_tables.read_long_table` reads
+    Each line is a record: time [s], roll, pitch, yaw [deg], x, y, z [m], as `text_tables.read_long_table` reads
     it. Another order is given by the names of the columns, with units or without, in a line
     ``#HEADER: "t", "x", ...`` or in a first line without numbers; ``#TIME_COLUMN: 0`` names the column of the time by
     its index from 0. Unlike HELIOS++, which sorts records, this function refuses times that go back.

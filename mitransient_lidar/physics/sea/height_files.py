@@ -14,10 +14,9 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.array_files import check_size, read_netcdf
-from mitransient_lidar.core.maps.coordinate_systems import map_system
-from mitransient_lidar.core.maps.grids import Grid, Stated, stated_by, undeclared_no_data, without_no_data
+from mitransient_lidar.core.maps import Grid, Stated, map_system, stated_by, undeclared_no_data, without_no_data
 from mitransient_lidar.core.tables.headings import METRES, Column, Heading, parse_heading, pick_columns
-from mitransient_lidar.core.tables.long_tables import read_long_table
+from mitransient_lidar.core.tables.text_tables import read_long_table
 from mitransient_lidar.core.validation import FloatArray, finite, positive
 
 logger = logging.getLogger(__name__)
@@ -230,7 +229,7 @@ def _is_down(name: str, attributes: Mapping[str, object], default: bool | None) 
 def read_points(path: Path) -> tuple[FloatArray, Stated]:
     """Read a point table.
 
-    `core.tables.long_tables.read_long_table` describes the format. A heading names the columns x, y and z, or easting,
+    `core.tables.text_tables.read_long_table` describes the format. A heading names the columns x, y and z, or easting,
     northing, and height, elevation or depth, with or without a unit of length. Without one they are the first three.
 
     Raises UserError as `read_long_table`; or if columns are missing, ambiguous, in an unknown unit, or angles; x and y

@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.array_files import Array, read_exr, read_npy, read_npz, readable_suffix
-from mitransient_lidar.core.maps.coordinate_systems import MapSystem
-from mitransient_lidar.core.maps.grids import Grid, read_ascii_grid, read_bag, read_geotiff
+from mitransient_lidar.core.maps import Grid, MapSystem, read_ascii_grid, read_bag, read_geotiff
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, positive
 from mitransient_lidar.physics.piecewise_linear import locate
 from mitransient_lidar.physics.sea.height_files import (

@@ -14,8 +14,14 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.core.validation import FloatArray, in_range
-from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
-from mitransient_lidar.physics.sea.foam import crest_heights, foam_cover, foam_on_crests, read_foam_map
+from mitransient_lidar.physics.sea.cox_munk import (
+    GramCharlierSeries,
+    cox_munk,
+    crest_heights,
+    foam_cover,
+    foam_on_crests,
+    read_foam_map,
+)
 from mitransient_lidar.physics.sea.height_maps import HeightMap, map_origin, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.realization import Motion, PeriodicHeights, realise_heights

@@ -14,8 +14,12 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables.headings import Column
 from mitransient_lidar.core.tables.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, finite, finite_array, positive
-from mitransient_lidar.physics.water.data_tables import PhaseFunction, log_log_interpolation
-from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_cdf
+from mitransient_lidar.physics.water.phase import (
+    PhaseFunction,
+    fournier_forand,
+    fournier_forand_cdf,
+    log_log_interpolation,
+)
 
 DEFAULT_LOG_S0 = float(np.log(1e-12))
 DEFAULT_COUNT = 2048

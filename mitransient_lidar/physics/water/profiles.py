@@ -13,7 +13,7 @@ import numpy.typing as npt
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.formats.array_files import read_netcdf, readable_suffix
-from mitransient_lidar.core.maps.grids import NO_DATA, undeclared_no_data
+from mitransient_lidar.core.maps import NO_DATA, undeclared_no_data
 from mitransient_lidar.core.tables.headings import METRES, PER_METRE, UNITLESS, Column, read_headings
 from mitransient_lidar.core.tables.text_tables import complete_rows, read_table
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import AVOGADRO, BOLTZMANN
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
-from mitransient_lidar.physics.water.data_tables import read_columns
+from mitransient_lidar.physics.water.phase import read_columns
 
 WAVELENGTH_RANGE = (400.0, 1100.0)
 """Wavelengths [nm] of all formulas and tables in this module."""

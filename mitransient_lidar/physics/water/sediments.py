@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import Checked, FloatArray, checked, in_range, is_number, shown
-from mitransient_lidar.physics.water.data_tables import read_columns
+from mitransient_lidar.physics.water.phase import read_columns
 
 #: Bottoms and land in the order of their table columns.
 _TABLES = {

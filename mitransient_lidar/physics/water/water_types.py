@@ -15,9 +15,8 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.water import COEFFICIENTS, LAYERED_WATER, WATER_KINDS
 from mitransient_lidar.core.validation import in_range, non_negative, positive
-from mitransient_lidar.physics.water.data_tables import read_columns
 from mitransient_lidar.physics.water.layers import WaterColumn
-from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_water
+from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_water, read_columns
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.seawater import (
     VISIBLE_RANGE,

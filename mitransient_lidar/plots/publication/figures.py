@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.files import together
 from mitransient_lidar.core.options import Option, checked, positive_option
-from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.plots.publication import drawings, waveforms
+from mitransient_lidar.plots.publication import waveforms
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.publication import quantities
@@ -40,9 +40,9 @@ _FIGURES = {
     "fig01b": _Figure(waveforms.example, quantities.backscatter),
     "fig02": _Figure(waveforms.mine, quantities.sphere),
     "fig04": _Figure(waveforms.mast, quantities.mast),
-    "fig05": _Figure(drawings.system, quantities.system),
-    "fig06": _Figure(drawings.mesh),
-    "fig08": _Figure(drawings.pixels, quantities.pixel_shapes),
+    "fig05": _Figure(waveforms.system, quantities.system),
+    "fig06": _Figure(waveforms.mesh),
+    "fig08": _Figure(waveforms.pixels, quantities.pixel_shapes),
     "fig09": _Figure(waveforms.pixels_over_bottom, quantities.pixels_over_bottom),
     "fig10": _Figure(waveforms.surface_echoes, quantities.surface_echoes),
     "fig11": _Figure(waveforms.bottom_echoes, quantities.bottom_echoes),

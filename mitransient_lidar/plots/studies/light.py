@@ -63,7 +63,7 @@ def _add_legend(ax: Axes, spread: xr.Dataset, styles: list[dict[str, Any]]) -> N
 
 
 def plot_fov_sweep(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the attenuations in `studies.fov_sweep.fov_sweep` against the spot radius in the field of view."""
+    """Draw the attenuations in `studies.light_classes.fov_sweep` against the spot radius in the field of view."""
     figure = drawing.new_figure(path, 7.2, 4.8)
     attributes = found.attrs
     names = ("attenuation", "kd", "a_plus_bb", "absorption", "beam_radius")

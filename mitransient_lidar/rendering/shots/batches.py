@@ -19,7 +19,7 @@ from mitransient_lidar.plugins.ocean_surface import SeaPatches
 from mitransient_lidar.rendering.accumulators import Light
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
-from mitransient_lidar.transport.light_maps.heights import HeightFields
+from mitransient_lidar.transport.light_maps.maps import HeightFields
 from mitransient_lidar.transport.light_maps.renderer import (
     REACH_THE_SURFACE,
     LightMapRenderer,

@@ -16,8 +16,8 @@ from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked, positive_option
 from mitransient_lidar.core.validation import FloatArray, IntArray, require_memory
 from mitransient_lidar.loading import variants
-from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.gate_train import GateSequence, GateTrain
 from mitransient_lidar.rendering.accumulators import placed_gates
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics

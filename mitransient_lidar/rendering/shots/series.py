@@ -33,9 +33,9 @@ from mitransient_lidar.core.tables.text_tables import read_two_columns
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
 from mitransient_lidar.loading import variants
-from mitransient_lidar.loading.exclusive import alone
-from mitransient_lidar.loading.instruments import with_infrared
+from mitransient_lidar.loading.catalogue import with_infrared
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene
+from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import (
     LIGHT,

@@ -15,8 +15,8 @@ import xarray as xr
 from mitransient_lidar.core.validation import FloatArray, integer, relative_error
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.catalogue import scene_parameters
-from mitransient_lidar.loading.exclusive import alone, alone_with_scene
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene
+from mitransient_lidar.loading.variants import alone, alone_with_scene
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.series import random_places, render_shots

@@ -23,8 +23,7 @@ from mitransient_lidar.physics.sea.shoaling import ShoalingHeights
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.two_way_spread import TwoWaySpread
-from mitransient_lidar.transport.light_maps.heights import HeightFields
-from mitransient_lidar.transport.light_maps.maps import LightMaps, Planes
+from mitransient_lidar.transport.light_maps.maps import HeightFields, LightMaps, Planes
 from mitransient_lidar.transport.medium.water_phases import table_of
 from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index
 from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, ReceivedLight

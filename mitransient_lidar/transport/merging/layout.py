@@ -10,12 +10,11 @@ import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import refract_level
-from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, RefractedProfile, WaterCells
+from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, RefractedProfile, SphericalCells, WaterCells
 from mitransient_lidar.transport.merging.patches import MOST_SIDE_BITS, SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.photon_map import PHOTONS_OF_CELL
 from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries, reach_under_water
 from mitransient_lidar.transport.merging.rings import CORE_PER_SPREAD, BeamRings, cell_widths
-from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS

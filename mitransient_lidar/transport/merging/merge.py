@@ -15,11 +15,10 @@ from itertools import pairwise
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.transport.merging.cells import WaterCells
+from mitransient_lidar.transport.merging.cells import SphericalCells, WaterCells
 from mitransient_lidar.transport.merging.patches import SolidPatches, foreshortening
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
-from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.opaque import opaque, opaque_index
 from mitransient_lidar.transport.paths.passes import ReceivedLight
 from mitransient_lidar.transport.paths.path import PathPoint, interaction_at

@@ -14,7 +14,7 @@ from mitransient_lidar import results
 from mitransient_lidar.cli.app import COMMANDS
 from mitransient_lidar.cli.generator import function_at
 from mitransient_lidar.core.options import declared
-from mitransient_lidar.results import netcdf
+from mitransient_lidar.results import files
 
 #: Arguments that commands need besides an option, the result RESULT included.
 NEEDED = {
@@ -87,14 +87,14 @@ def result(tmp_path_factory):
     path = tmp_path_factory.mktemp("result") / "result.nc"
     made = synthetic_shots.result()
     results.save(made.assign(waveform=made["waveform"].clip(0, keep_attrs=True)), path)
-    once = functools.cache(netcdf.read)
+    once = functools.cache(files.read_netcdf)
 
     def read(given):
         dataset, foreign = once(given)
         return dataset.copy(), foreign
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(netcdf, "read", read)
+        patched.setattr(files, "read_netcdf", read)
         yield path
 
 

@@ -8,7 +8,7 @@ from array_inputs import write_bag
 from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.maps.grids import read_bag
+from mitransient_lidar.core.maps import read_bag
 from mitransient_lidar.physics.sea.height_maps import read_height_map
 
 HEIGHTS = np.array([[-1.0, -2, -3], [-4, -5, 1e6]])

@@ -12,7 +12,7 @@ from rows import each_row
 
 from mitransient_lidar import results
 from mitransient_lidar.core.marks import holds_mark, read_mark, write_mark
-from mitransient_lidar.results import netcdf
+from mitransient_lidar.results import files
 
 MARK = {"command": "render", "text": "a -- b --> ä", "parameters": {"depth": "8"}}
 FIGURES = (".png", ".pdf", ".svg")
@@ -34,7 +34,7 @@ def file(request, tmp_path):
         frames = [Image.fromarray(np.full((8, 8), shade, np.uint8)) for shade in (0, 90, 200)]
         frames[0].save(path, save_all=True, append_images=frames[1:])
     elif request.param == ".nc":
-        netcdf.write(xr.Dataset({"a": ("x", np.arange(1000.0))}, attrs={"scene": "table1"}), path)
+        files.write_netcdf(xr.Dataset({"a": ("x", np.arange(1000.0))}, attrs={"scene": "table1"}), path)
     else:
         path.write_text("<!doctype html><title>-- page --</title><p>text")
     return path
@@ -92,14 +92,14 @@ def test_mark_of_a_figure_stands_where_its_format_allows(tmp_path):
 
 def test_checksum_of_a_marked_file_is_checked(tmp_path):
     path = tmp_path / "a.nc"
-    netcdf.write(xr.Dataset({"a": ("x", np.arange(1000.0))}), path)
+    files.write_netcdf(xr.Dataset({"a": ("x", np.arange(1000.0))}), path)
     write_mark(path, MARK)
-    assert netcdf.check_sum(path)
+    assert files.check_sum(path)
     data = bytearray(path.read_bytes())
     data[-3000] ^= 1
     path.write_bytes(data)
     with pytest.raises(ValueError, match="SHA-256"):
-        netcdf.check_sum(path)
+        files.check_sum(path)
 
 
 def test_what_is_no_regular_file_has_no_mark(tmp_path):

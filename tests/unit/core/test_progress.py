@@ -7,7 +7,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 import mitransient_lidar
-from mitransient_lidar.core import progress as shown
+from mitransient_lidar.core import options as shown
 from mitransient_lidar.core.options import checked
 from mitransient_lidar.rendering.passes import Progress
 

@@ -13,7 +13,7 @@ import pytest
 
 import mitransient_lidar
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.variants import alone
 
 #: Functions that begin a use of Mitsuba, and classes and functions that leave it to their callers to be alone.
 BEGIN = {"open_scene", "choose_integrator", "find_lidar_scene"}
@@ -78,7 +78,7 @@ def test_an_interruption_ends_the_waiting(busy, defers):
 def test_a_forked_process_does_not_wait_for_threads_that_it_lacks():
     script = """
 import os, threading
-from mitransient_lidar.loading.exclusive import alone
+from mitransient_lidar.loading.variants import alone
 begun, end = threading.Event(), threading.Event()
 threading.Thread(target=alone(lambda: begun.set() or end.wait(60))).start()
 begun.wait()

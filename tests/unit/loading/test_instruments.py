@@ -9,7 +9,7 @@ from rows import each_row
 
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.loading import catalogue, instruments, scenes
+from mitransient_lidar.loading import catalogue, scenes
 
 NAMES = (
     *("icesat2_atlas", "leica_chiroptera4x", "leica_chiroptera4x_infrared", "leica_hawkeye4x_deep", "optech_titan"),
@@ -46,12 +46,12 @@ def parts(loaded):
 
 def values(name):
     """Return the values of an instrument by their names, without empty ones."""
-    return {each.name: each.value for each in instruments.read_instrument(name).parameters if each.value}
+    return {each.name: each.value for each in catalogue.read_instrument(name).parameters if each.value}
 
 
 @each_row("name", NAMES)
 def test_every_value_that_is_needed_has_a_source_or_is_assumed(name):
-    instrument, given = instruments.read_instrument(name), values(name)
+    instrument, given = catalogue.read_instrument(name), values(name)
     assert given.keys() >= NEEDED
     assert len([key for key in given if key.startswith("divergence")]) == 1
     assert "field_of_view_mrad" in given or "shallow_view_mrad" in given
@@ -64,7 +64,7 @@ def test_every_value_that_is_needed_has_a_source_or_is_assumed(name):
             assert references or parameter.is_assumed, parameter
             cited |= references
     cited |= set(re.findall(r"\[(\d)\]", re.sub(r"^\[\d\]", "", instrument.description, flags=re.MULTILINE)))
-    cited |= set(re.findall(r"as in \[(\d)\]", instruments.instrument_text(name)))
+    cited |= set(re.findall(r"as in \[(\d)\]", catalogue.instrument_text(name)))
     assert cited == listed
 
 
@@ -79,7 +79,7 @@ def test_the_loaded_lidar_has_the_values_of_the_file(name):
     assert transmitter.divergence == pytest.approx(1e-3 * beam)
     view = max(value for key, value in given.items() if key.endswith("view_mrad"))
     assert receiver.pixels.field_of_view == pytest.approx(1e-3 * view)
-    assert tuple(receiver.pixels.names) == instruments.read_instrument(name).channels
+    assert tuple(receiver.pixels.names) == catalogue.read_instrument(name).channels
     for pose in (transmitter.pose, receiver.pose):
         assert pose.origin[2] == pytest.approx(given["altitude"])
         assert np.degrees(np.arccos(-pose.axis[2])) == pytest.approx(given["off_nadir_deg"], abs=1e-3)
@@ -120,7 +120,7 @@ def test_the_lidar_keeps_its_aim_and_the_water_has_its_wavelength(tmp_path):
 
 
 def test_the_printed_xml_is_included_by_a_scene(tmp_path):
-    (tmp_path / "instrument.xml").write_text(instruments.instrument_text("teledyne_czmil"))
+    (tmp_path / "instrument.xml").write_text(catalogue.instrument_text("teledyne_czmil"))
     path = tmp_path / "sea.xml"
     path.write_text(SEA.format(lidar='<include filename="instrument.xml"/>'))
     ours, plain = scenes.open_scene(path).scene, mi.load_file(str(path), optimize=False)
@@ -154,7 +154,7 @@ def test_files_of_the_scene_are_found_with_an_instrument(tmp_path, monkeypatch):
     ],
 )
 def test_unknown_instruments_are_refused(name, sentence):
-    for call in (instruments.read_instrument, instruments.instrument_text):
+    for call in (catalogue.read_instrument, catalogue.instrument_text):
         with pytest.raises(UserError, match=sentence):
             call(name)
     with pytest.raises(UserError, match=sentence):
@@ -177,7 +177,7 @@ def test_what_an_instrument_does_not_fit_is_refused(scene, params, sentence):
 def test_parameters_of_an_infrared_channel():
     """Scene, altitude and aim are shared; the lidar's own parameters are not."""
     given = {"wind_speed": 3, "altitude": 400, "pulse_fwhm_ns": 2, "time_start_ns": 9, "infrared.off_nadir_deg": 5}
-    (name, own), (channel, other) = instruments.with_infrared("riegl_vq880g2", given)
+    (name, own), (channel, other) = catalogue.with_infrared("riegl_vq880g2", given)
     assert (name, channel) == ("riegl_vq880g2", "riegl_vq880g2_infrared")
     assert own == {"wind_speed": 3, "altitude": 400, "pulse_fwhm_ns": 2, "time_start_ns": 9}
     assert other == {"wind_speed": 3, "altitude": 400, "off_nadir_deg": 5, "coefficients_nm": 532}
@@ -187,7 +187,7 @@ def test_parameters_of_an_infrared_channel():
     assert (water.water.column.absorption > 14.3).all()
     for refused in (None, "riegl_vq840g", "riegl_vq880g2_infrared"):
         with pytest.raises(UserError, match=r"has no infrared channel; instruments with one are .*riegl_vq880g2"):
-            instruments.with_infrared(refused, {})
+            catalogue.with_infrared(refused, {})
 
 
 def test_shipped_corrections_are_of_their_instrument():
@@ -197,5 +197,5 @@ def test_shipped_corrections_are_of_their_instrument():
         name = path.stem.removesuffix("_depths")
         table = corrections_for(name, "auto")
         assert table.attrs["instrument"] == name
-        assert tuple(table["pixel"].values) == instruments.read_instrument(name).channels
+        assert tuple(table["pixel"].values) == catalogue.read_instrument(name).channels
         assert np.isfinite(table["bias"].sel(estimator="gaussian", wind_speed=0)).any()

@@ -4,7 +4,7 @@ import numpy as np
 from figure_inputs import frames
 from PIL import Image
 
-from mitransient_lidar.plots.passive import animate_passive
+from mitransient_lidar.plots.gates.images import animate_passive
 
 
 def test_animation_shows_the_frames_in_their_time(tmp_path):

@@ -30,11 +30,11 @@ resource.setrlimit(resource.RLIMIT_DATA, (6 * 2**30,) * 2)
 import mitransient_lidar as ml
 from mitransient_lidar.analysis import receiver
 from mitransient_lidar.rendering.passive import render_passive
-from mitransient_lidar.results import netcdf
+from mitransient_lidar.results.files import write_netcdf
 small = {"bin_count": 400, "time_start_ns": 1380}
 def record(shots):
     found = ml.record(result, "apd", shots=shots)
-    netcdf.write(found, sys.argv[3])
+    write_netcdf(found, sys.argv[3])
 result = ml.render("table1", params=small, passes=2)
 def passive(pixels, **options):
     render_passive("passive_sea", params={"layout": f"{pixels}x{pixels}"}, passes=2, **options)

@@ -11,7 +11,7 @@ from mitransient_lidar.analysis.retrieval.column_retrieval import ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.studies.fov_sweep import fov_sweep, slope_and_error
+from mitransient_lidar.studies.light_classes import fov_sweep, slope_and_error
 
 C0 = 0.299792458  # m/ns
 HEIGHT, INDEX, GROUP = 150.0, 1.33, 1.4

@@ -8,7 +8,7 @@ import pytest
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.loading.instruments import instrument_names, read_instrument
+from mitransient_lidar.loading.catalogue import instrument_names, read_instrument
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier

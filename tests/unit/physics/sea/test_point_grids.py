@@ -8,7 +8,7 @@ import pytest
 from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.tables import long_tables
+from mitransient_lidar.core.tables import text_tables
 from mitransient_lidar.physics.sea.height_files import read_points
 from mitransient_lidar.physics.sea.height_maps import read_height_map
 
@@ -64,7 +64,7 @@ def test_points_without_a_height_are_left_out(tmp_path, missing, caplog):
     ],
 )
 def test_other_tables_are_refused(tmp_path, monkeypatch, text, message):
-    monkeypatch.setattr(long_tables, "_MOST_ROWS", 5)
+    monkeypatch.setattr(text_tables, "_MOST_ROWS", 5)
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(UserError, match=message):
         read_points(tmp_path / "a.csv")

@@ -1,1 +1,0 @@
-"""Maps: height grids, and coordinate systems."""
