@@ -111,6 +111,18 @@ def test_turbid_water_without_a_visible_bottom_has_none():
     assert (bottom == EchoClass.NONE).all()
 
 
+def test_clear_seas_below_a_step_of_the_digitiser_are_no_land():
+    """A low gain rounds the column of the clearest water to nothing, which was taken for dry land."""
+    levels, glints = np.repeat([-0.1, 0.0, 0.1], 3), np.tile([0.02, 0.1, 0.5], 3)
+    clear = {"reflectance": 0.05, "attenuation": 0.04, "backscattering": 1.3e-3}
+    seas = [water(60, glint / 0.05, level=level, **clear) for level, glint in zip(levels, glints, strict=True)]
+    heights = np.array([0.5, 1.0, 3.0])
+    (surface, bottom), depth, _ = found(recorded([*seas, *map(land, heights)], 5, gain=0.012))
+    assert (surface[:9] == EchoClass.SURFACE).all()
+    assert (bottom[9:] == EchoClass.LAND).all()
+    np.testing.assert_allclose(depth[9:], -heights, atol=0.03)
+
+
 def test_turbid_water_seen_by_long_pulses_has_no_bottom():
     """A blurred bottom below a column of a free decay fits such columns as well, with more parameters."""
     kinds = [(k, b, glint) for k, b in ((0.5, 0.03), (0.75, 0.1)) for glint in (0.0, 0.02)]
