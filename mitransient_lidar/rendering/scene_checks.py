@@ -78,8 +78,8 @@ def warn_of_shadows(scene: LidarScene) -> None:
     lit = [str(target.id()) for target in scene.targets if not light_faintly(scene, target, place, None)[0]]
     if lit:
         logger.warning(
-            "light = 'maps' leaves out the shadows of %s in the beam: targets are a few per cent too dark, and the bottom "
-            "beside them too bright",
+            "light = 'maps' leaves out the shadows of %s in the beam: targets are a few per cent too dark, and the "
+            "bottom beside them too bright",
             ", ".join(lit[:_MOST_NAMED]),
         )
 
