@@ -45,7 +45,7 @@ from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.rendering.passes import ProgressCallback
-from mitransient_lidar.rendering.shots.batches import ReceivedShots, ShotPoses
+from mitransient_lidar.rendering.shots.batches import ShotPoses
 from mitransient_lidar.rendering.shots.pilots import PILOTS, pilots_over, rendered
 from mitransient_lidar.rendering.shots.scene import ShotScene
 from mitransient_lidar.rendering.shots.series import render_shots

@@ -115,8 +115,9 @@ def test_series_by_maps_are_rendered_again():
     ],
 )
 def test_what_maps_are_not_for(options, message):
-    with pytest.raises(UserError, match=message):
-        mitransient_lidar.render_shots("table1", **{"positions": [[0, 0]], **options})
+    for render, more in ((mitransient_lidar.render, {}), (mitransient_lidar.render_shots, {"positions": [[0, 0]]})):
+        with pytest.raises(UserError, match=message):
+            render("table1", **more, **options)
 
 
 @pytest.mark.slow
@@ -216,3 +217,34 @@ def test_flights_by_maps_find_the_same_bottoms():
     z = ((other - depth) / np.hypot(error, own))[seen]
     assert np.sum(z**2) < 1.5 * significance.largest_chi2(z.size)
     assert abs(np.mean((other - depth)[seen])) < 0.02 + 4 * np.std((other - depth)[seen]) / np.sqrt(z.size)
+
+
+@pytest.mark.slow
+def test_maps_of_images_resolve_fine_waves(monkeypatch):
+    """Water within 3 m of waves from 0.1 m: cells of a shot, 0.2 m wide, focus it more, and finer cells no less."""
+    lidar, _session = lidar_of({"wind_speed": 3, "shortest_wave": 0.1, "cell_size": 0.03, "bin_width_ns": 1})
+    times = lidar.axis.centres_ns - Probe(lidar).echoes.surface_ns.mean()
+    near = (times > 4) & (times <= 28)
+
+    def energy(renderer):
+        shape = lidar.receiver.pixels.count, renderer.classes.count, -1
+        passes = [renderer.render_pass(seed).histogram.energy().reshape(shape)[:, 1, near].sum() for seed in range(6)]
+        return significance.mean_and_error(np.array(passes))
+
+    wide = energy(LightMapRenderer(lidar, PathClasses()).by_origin().scaled(64))
+    own = energy(LightMapRenderer(lidar, PathClasses(), image=True).by_origin())
+    monkeypatch.setattr("mitransient_lidar.transport.light_maps.renderer._CELLS_PER_WAVE", 4)
+    fine = energy(LightMapRenderer(lidar, PathClasses(), image=True).by_origin())
+    assert max(error / mean for mean, error in (wide, own, fine)) < 0.004
+    assert abs(own[0] / fine[0] - 1) < 0.006
+    assert wide[0] > 1.015 * own[0]
+
+
+@pytest.mark.slow
+def test_images_by_maps_are_rendered_again_and_warn_of_shadows(caplog):
+    params = {"layout": "64x64", "gate_count": 10, "gate_width_ns": 4, "target_depth": 9, "bottom_depth": 12}
+    stack = mitransient_lidar.render("gated_mine", params, light="maps", passes=2)
+    assert stack.attrs["light"] == "maps"
+    assert "light = 'maps' leaves out the shadows of target, plate in" in caplog.text
+    again = mitransient_lidar.render(stack)
+    xr.testing.assert_identical(again["gate_energy"], stack["gate_energy"])

@@ -24,7 +24,6 @@ from mitransient_lidar.core.options import (
     SceneOrResult,
     Sensor,
     checked,
-    one_of,
     positive_option,
 )
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
@@ -38,7 +37,6 @@ from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import (
-    LIGHT,
     Components,
     LightOption,
     Progress,
@@ -206,11 +204,11 @@ def render_shots(
         options_given |= {"params": other, "instrument": channel, "axis": None}
         options_given["positions"] = np.column_stack([green[name] for name in AIM])
         return join(green, render_shots(**options_given))
-    options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
+    differentiated = [*derivatives] if derivatives else None
+    options = RenderOptions(
+        target_error=target_error, max_time=max_time, pass_share=pass_share, derivatives=differentiated, light=light
+    )
     wanted = options.target_error
-    one_of("light", light, LIGHT)
-    if light == "maps" and derivatives:
-        raise UserError("light = 'maps' has no derivatives: use light = 'merging'")
     usual = (8, 1.0) if wanted is None else (MOST_PASSES_FOR_ERROR, share_for_error(wanted))
     if light == "maps":
         usual = 2 if wanted is None else MOST_PASSES_FOR_ERROR, 1.0
