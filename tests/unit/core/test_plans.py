@@ -8,7 +8,7 @@ import pytest
 
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Plan, parts
+from mitransient_lidar.core.options import Plan, checked, parts
 from mitransient_lidar.flights.plan import FlightPlan
 
 #: Values that a key without a usual one may have, where its declaration does not tell one.
@@ -85,3 +85,17 @@ def test_each_key_is_read_refused_and_documented_by_its_declaration(plan):
         plan.of({**usual_table, "colour": 3}, "the table")
     with pytest.raises(UserError, match=r"^the table = 3 must be a table$"):
         plan.of(3, "the table")
+
+
+def test_options_named_by_their_module_are_checked():
+    """And types in modules that checkers alone import are left."""
+
+    def drawn(seed=0, table=None):
+        """Draw."""
+        return seed
+
+    drawn.__annotations__ = {"seed": "options.Seed", "table": "frames.Table"}
+    assert checked(drawn)(3, table=4) == 3
+    assert "Random seed" in checked(drawn).__doc__
+    with pytest.raises(UserError, match="seed = -1 must lie between 0"):
+        checked(drawn)(-1)
