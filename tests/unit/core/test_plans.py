@@ -7,8 +7,9 @@ from typing import get_args, get_origin
 import pytest
 
 from mitransient_lidar.campaigns.design import Campaign
+from mitransient_lidar.core import options
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Plan, checked, parts
+from mitransient_lidar.core.options import Plan, parts
 from mitransient_lidar.flights.plan import FlightPlan
 
 #: Values that a key without a usual one may have, where its declaration does not tell one.
@@ -95,7 +96,7 @@ def test_options_named_by_their_module_are_checked():
         return seed
 
     drawn.__annotations__ = {"seed": "options.Seed", "table": "frames.Table"}
-    assert checked(drawn)(3, table=4) == 3
-    assert "Random seed" in checked(drawn).__doc__
+    assert options.checked(drawn)(3, table=4) == 3
+    assert "Random seed" in options.checked(drawn).__doc__
     with pytest.raises(UserError, match="seed = -1 must lie between 0"):
-        checked(drawn)(-1)
+        options.checked(drawn)(-1)
