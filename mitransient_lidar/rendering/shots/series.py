@@ -141,8 +141,6 @@ def render_shots(
     move_target
         Whether the target keeps its position relative to the aim; the scene needs the parameters ``target_x`` and
         ``target_y``.
-    passes
-        Passes of each shot, 2 to 10 000; by default 8. With a `target_error`, the most, by default 400.
     target_error
         Relative standard error, greater than 0, at most 1, that ends a batch's passes, after at least 4 of them. The
         median over the bins of lit pixels from the surface echo to the end of the bottom echo must have reached it.
@@ -167,14 +165,10 @@ def render_shots(
         again.
     derivatives
         Names of parameters by which the light is differentiated, as for `rendering.render.render`.
-    infrared
-        Whether to render the infrared channel of the instrument at the same places, too, as for `render`.
     describe_sea
         Whether to add the attribute ``slope_deviation``, which takes 0.2 s.
     merge_unsuited
         Whether to merge the light of a scene that maps do not suit, or with a target in the light of a shot.
-    progress
-        Called with a `passes.Progress` after every batch of shots.
 
     Returns
     -------
