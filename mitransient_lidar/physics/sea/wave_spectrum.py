@@ -208,13 +208,6 @@ class MatchedSpectrum(CosineSpectrum):
     scaled, positive. If the others alone have too much slope variance, or a ratio that scaling cannot correct, it is
     reduced in steps of a tenth. Below the longest wave all are scaled.
 
-    Attributes
-    ----------
-    scaled_from : float
-        Wavenumber above which waves are scaled [rad/m].
-    scales : tuple of float
-        Factors along and across the direction [1].
-
     Notes
     -----
     With the fractions 1/2 +- Delta/4 of the slope variance k^2 S, factors s_u and s_c give
@@ -227,8 +220,8 @@ class MatchedSpectrum(CosineSpectrum):
     crosswind: float
     k_from: float = 2 * np.pi
     direction: float = field(init=False)
-    scaled_from: float = field(init=False)
-    scales: tuple[float, float] = field(init=False)
+    scaled_from: float = field(init=False)  #: Wavenumber above which waves are scaled [rad/m].
+    scales: tuple[float, float] = field(init=False)  #: Factors along and across the direction [1].
 
     def __post_init__(self) -> None:
         if not isinstance(self.spectrum, CosineSpectrum):
