@@ -53,21 +53,11 @@ class Array(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Renderer(ABC):
-    """Renderer for the runs in a store, each with the same bits wherever and whenever.
+    """Renderer for the runs in a store, each with the same bits wherever and whenever."""
 
-    Attributes
-    ----------
-    plan
-        The campaign or the flight.
-    scene
-        Its scene, with its instrument.
-    axis
-        Time bins for all runs; None where each has its own.
-    """
-
-    plan: Any
-    scene: SceneSource
-    axis: TimeAxis | None = None
+    plan: Any  #: The campaign or the flight.
+    scene: SceneSource  #: Its scene, with its instrument.
+    axis: TimeAxis | None = None  #: Time bins for all runs; None where each has its own.
 
     #: Plan class, unit name, and title of a store of such units.
     plan_type: ClassVar[Any]

@@ -89,8 +89,6 @@ def campaign(
     shard_size
         Runs per shard, which one process renders and writes, 1 to 1 000 000; by default a sixteenth of the runs, but 8
         to 1024, and fewer where a shard would need more than half a gigabyte.
-    progress
-        Called with a `rendering.passes.Progress` about every second.
 
     Returns
     -------

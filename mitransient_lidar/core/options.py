@@ -86,9 +86,6 @@ def _bar() -> Iterator[Callable[[Any], None]]:
         handle.update(display.HTML(""))
 
 
-#: Annotations as texts that may have an `Option`.
-_MAY_HAVE = re.compile(r"\w+$|Annotated\[")
-
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -211,12 +208,19 @@ def declared(function: Callable[..., Any]) -> dict[str, tuple[Any, Option]]:
         hints = get_type_hints(function, include_extras=True)
     else:  # other types are not evaluated: checkers alone may know them, and help does without xarray
         given = {name: str(text) for name, text in hinted.__annotations__.items() if name != "return"}
-        hints = {name: eval(text, hinted.__globals__) for name, text in given.items() if _MAY_HAVE.match(text)}
+        hints = {name: eval(text, hinted.__globals__) for name, text in given.items() if _may_have(text, hinted)}
     for name, hint in hints.items():
         if get_origin(hint) is Annotated:
             kind, *others = get_args(hint)
             found.update((name, (kind, one)) for one in others if isinstance(one, Option))
     return found
+
+
+def _may_have(text: str, function: Any) -> bool:
+    """Return whether an annotation as text may have an `Option`: a name, also in a module of the package, or a type."""
+    if dotted := re.fullmatch(r"(\w+)\.[\w.]+", text):
+        return getattr(function.__globals__.get(dotted[1]), "__name__", "").startswith("mitransient_lidar.")
+    return text.isidentifier() or text.startswith("Annotated[")
 
 
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:

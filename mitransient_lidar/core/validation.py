@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy.typing import ArrayLike as ArrayLike
 
 from mitransient_lidar.core.errors import UserError
 
@@ -112,7 +113,7 @@ def shown(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def finite_array(name: str, values: npt.ArrayLike) -> FloatArray:
+def finite_array(name: str, values: ArrayLike) -> FloatArray:
     """Return `values` as a new float64 array without NaN or infinity."""
     try:
         array = np.array(values, dtype=np.float64)
@@ -153,7 +154,7 @@ def is_number(text: str) -> bool:
     return True
 
 
-def non_negative_array(name: str, values: npt.ArrayLike) -> FloatArray:
+def non_negative_array(name: str, values: ArrayLike) -> FloatArray:
     """Return `values` as a new float64 array with finite numbers of at least 0."""
     array = finite_array(name, values)
     if np.any(array < 0):
@@ -161,7 +162,7 @@ def non_negative_array(name: str, values: npt.ArrayLike) -> FloatArray:
     return array
 
 
-def increasing_array(name: str, values: npt.ArrayLike) -> FloatArray:
+def increasing_array(name: str, values: ArrayLike) -> FloatArray:
     """Return `values` as a new one-dimensional float64 array of 2 or more strictly increasing numbers."""
     array = finite_array(name, values)
     if array.ndim != 1 or array.size < 2:
@@ -171,7 +172,7 @@ def increasing_array(name: str, values: npt.ArrayLike) -> FloatArray:
     return array
 
 
-def time_samples(times_ns: npt.ArrayLike, name: str, values: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+def time_samples(times_ns: ArrayLike, name: str, values: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Return strictly increasing times, 2 or more, and one value for each."""
     t, v = increasing_array("times_ns", times_ns), finite_array(name, values)
     if t.shape != v.shape:

@@ -100,8 +100,6 @@ def render_passive(
     target_error, target_quantile, max_time, passes
         End of a frame, as for `render.render` with pixels instead of bins; by default 0.05 within 120 s. `passes` may
         be a list with one number per frame.
-    params, variant
-        As for `render.render`.
     seed
         Integer from -2^63 to 2^63 - 1, 0 by default; frames and passes have independent random numbers.
     frame_step_s
@@ -111,8 +109,6 @@ def render_passive(
         Standard deviation of a Gaussian that smooths, in each pass, the radiance of paths that the water has scattered
         on their way to the receiver, 0.2 to 20 pixels; none by default. Reflections, and what is seen without
         scattering, stay sharp. The attribute ``smoothing_bias`` estimates the relative change, rms over the pixels.
-    progress
-        Called with a `passes.Progress` of the frame after every pass.
 
     Returns
     -------

@@ -110,9 +110,6 @@ def render(
     max_time
         Longest time for the passes [s], greater than 0. At least two passes are rendered; where full ones would take
         longer, with fewer paths (the attribute ``pass_share``).
-    passes
-        Number of passes, 2 to 10^9. By default, the render ends at an error of 0.03 or after 300 s, with gates at 0.1
-        or after 60 s.
     seed
         Integer from -2^63 to 2^63 - 1, 0 by default; the same seed gives the same result on the same machine.
     max_memory
@@ -146,8 +143,6 @@ def render(
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here. The previously
         active variant is active again afterwards.
-    progress
-        Called with a `passes.Progress` after every pass.
     **others
         Options of `shots.series.render_shots` or `passive.render_passive`, for their results.
 

@@ -16,12 +16,11 @@ from os import PathLike
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import ArrayLike, FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain, range_time_ns
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import sum_errors
@@ -108,8 +107,8 @@ def gate_depths(train: GateTrain, attributes: Mapping[str, Any]) -> FloatArray:
 
 
 def build_gates(
-    energy: npt.ArrayLike,
-    stderr: npt.ArrayLike,
+    energy: ArrayLike,
+    stderr: ArrayLike,
     train: GateTrain,
     *,
     coords: Mapping[Any, Any],
@@ -154,7 +153,7 @@ def build_gates(
     return stack
 
 
-def add_gate_derivatives(stack: xr.Dataset, slopes: npt.ArrayLike, stderr: npt.ArrayLike) -> xr.Dataset:
+def add_gate_derivatives(stack: xr.Dataset, slopes: ArrayLike, stderr: ArrayLike) -> xr.Dataset:
     """Return a gate stack from `build_gates` with the derivatives of its energies by parameters.
 
     The derivatives and their standard errors are in J per unit of the parameter, shape (parameter, pixel, gate).

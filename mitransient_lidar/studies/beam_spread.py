@@ -8,12 +8,11 @@ from typing import Annotated, Any
 
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import FewerPasses, Instrument, Numbers, Option, Scene, Seed, checked
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import ArrayLike, BoolArray, FloatArray
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
@@ -163,7 +162,7 @@ def _measure(lidar: LidarScene, light: PlaneCrossings, depth: float, axes: dict[
         unknown = {name: np.full(len(axes[_CURVES[name]]), np.nan) if name in _CURVES else np.nan for name in _MEASURED}
         return {**unknown, **shares}
 
-    def mean(values: npt.ArrayLike) -> float:
+    def mean(values: ArrayLike) -> float:
         return float(np.average(np.asarray(values), weights=weight))
 
     def within(values: FloatArray, limits: FloatArray) -> FloatArray:
@@ -189,7 +188,7 @@ def _measure(lidar: LidarScene, light: PlaneCrossings, depth: float, axes: dict[
     }
 
 
-def _in_view(lidar: LidarScene, light: PlaneCrossings, depth: float) -> npt.NDArray[np.bool_]:
+def _in_view(lidar: LidarScene, light: PlaneCrossings, depth: float) -> BoolArray:
     """Return whether the line of sight from the receiver to the light through a level sea is in a pixel."""
     pose, pixels = lidar.receiver.pose, lidar.receiver.pixels
     points = np.stack([light.x, light.y, np.full_like(light.x, -depth)], axis=1)

@@ -105,8 +105,6 @@ def bounds(
     max_time
         Time after which no design is begun [s], above 0; the first one always is. The attribute ``designs_left_out``
         has the number of omitted designs, with a warning.
-    seed
-        Random seed, at least 0; all designs use the same random numbers.
 
     Returns
     -------

@@ -127,8 +127,6 @@ def depth_bias(
     params, scene
         A scene with the parameters ``aim_x``, ``aim_y``, ``off_nadir_deg``, ``wind_speed``, ``spectrum``, ``jerlov``
         and ``bottom_depth``, and further parameters.
-    angles_deg
-        Angles from nadir [degree], ascending; by default the instrument's, and 5 degrees more, or less near grazing.
     waters
         Jerlov types, from clear to turbid, at 532 nm, whatever the instrument has.
     depths

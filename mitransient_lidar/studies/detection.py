@@ -100,8 +100,6 @@ def detect(
     ----------
     scene, params, instrument, integrator
         As for `target_signal.target_signal`, with at most 16 pixels, or gates for a camera.
-    receiver
-        Detector and electronics of every pixel, or a camera, or the name of one in `physics.receiver.receiver_files`.
     shots
         Random shots without and with the target, 100 to 100 000; with clutter rounded up to a multiple of it. A camera
         needs none.

@@ -113,8 +113,6 @@ def fit(
     free
         Names of the free parameters, such as ``attenuation``, ``attenuation[1]`` for the second layer, or
         ``bottom_reflectance``; and ``bandwidth_mhz``, the half-power frequency of a single-pole receiver [MHz].
-    params, instrument
-        Other values of the scene's parameters, and instrument that replaces its lidar; see `rendering.render.render`.
     start
         Starts of free parameters, by default their values in the scene; also for ``scale`` and ``time_offset_ns``.
     bounds
@@ -126,8 +124,6 @@ def fit(
     passes
         Passes per render, 2 to 10^9; by default 16 to 256: as many as make the median variance by the model's Monte
         Carlo a tenth of the waveforms' variance.
-    seed
-        Seed of all renders, so that they share their random numbers; by default 1, or for a result its own plus 1.
     max_time
         Time after which no step is tried [s], above 0: the fit ends at the last step, without convergence and with a
         warning. The start is always rendered.

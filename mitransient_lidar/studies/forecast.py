@@ -184,8 +184,6 @@ def forecast(
         As of `depth_correction.correct_depths`.
     pointing_mrad, position_m, height_m
         As for `depth_bias.tpu`.
-    progress
-        Called with a `passes.Progress` after every water.
 
     Returns
     -------

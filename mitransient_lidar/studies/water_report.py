@@ -7,18 +7,16 @@ from pathlib import Path
 from typing import Annotated
 from xml.sax.saxutils import quoteattr
 
-import numpy.typing as npt
-
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import ArrayLike, FloatArray
 from mitransient_lidar.physics.water import seawater, water_types
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters, petzold_water
 from mitransient_lidar.physics.water.profiles import Profile, read_profile
 from mitransient_lidar.physics.water.water_types import water_of
 
 #: Maps angles [rad] to p [1/sr].
-PhaseFunction = Callable[[npt.ArrayLike], FloatArray]
+PhaseFunction = Callable[[ArrayLike], FloatArray]
 
 REPORTED_KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "profile", "pure")
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, non_negative_array
+from mitransient_lidar.core.validation import ArrayLike, FloatArray, non_negative_array
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -261,7 +260,7 @@ SPOT_COEFFICIENT = 0.85
 """Rate at which the system attenuation falls from c to Kd with the spot diameter in attenuation lengths."""
 
 
-def system_attenuation(attenuation: npt.ArrayLike, kd: npt.ArrayLike, spot_diameter: npt.ArrayLike) -> FloatArray:
+def system_attenuation(attenuation: ArrayLike, kd: ArrayLike, spot_diameter: ArrayLike) -> FloatArray:
     """One-way attenuation coefficient of a lidar's column signal.
 
     Returns K = Kd + (c - Kd) exp(-0.85 c D) [1/m], in the broadcast shape of the parameters. Without its geometric

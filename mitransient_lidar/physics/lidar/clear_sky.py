@@ -8,11 +8,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import is_green
-from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
+from mitransient_lidar.core.validation import ArrayLike, FloatArray, finite_array, in_range, positive
 
 #: Sun's angular radius [deg].
 SUN_RADIUS_DEG = 0.2666
@@ -106,7 +105,7 @@ def _forward_fraction(cosine: float, exponent: float) -> float:
     return float(1 - 0.5 * np.exp((first + second * cosine) * cosine))
 
 
-def background_power(radiance: npt.ArrayLike, etendue: npt.ArrayLike, filter_width_nm: float) -> FloatArray:
+def background_power(radiance: ArrayLike, etendue: ArrayLike, filter_width_nm: float) -> FloatArray:
     """Daylight power on a detector [W], the product of the arguments.
 
     `radiance`: radiance [W m^-2 sr^-1 nm^-1]. `etendue`: open aperture area times pixel solid angle times transmittance

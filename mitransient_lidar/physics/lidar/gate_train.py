@@ -13,13 +13,13 @@ from os import PathLike
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables.headings import UNITLESS, Column
 from mitransient_lidar.core.tables.text_tables import read_time_samples
 from mitransient_lidar.core.validation import (
+    ArrayLike,
     Checked,
     FloatArray,
     IntArray,
@@ -94,7 +94,7 @@ class GateShape:
         return cls(width_ns, rise_ns, fall_ns, np.zeros(0), np.zeros(0))
 
     @classmethod
-    def sampled(cls, times_ns: npt.ArrayLike, transmission: npt.ArrayLike) -> GateShape:
+    def sampled(cls, times_ns: ArrayLike, transmission: ArrayLike) -> GateShape:
         """Measured gate; its width and edge times follow from the samples.
 
         `times_ns`: strictly increasing times [ns], at least 2, shape (S,). They are shifted so that the transmission
@@ -148,7 +148,7 @@ class GateShape:
             return float(self.times_ns[0]), float(self.times_ns[-1])
         return -0.5 * _EDGE_PER_RISE * self.rise_ns, self.width_ns + 0.5 * _EDGE_PER_RISE * self.fall_ns
 
-    def open_time(self, t_ns: npt.ArrayLike) -> FloatArray:
+    def open_time(self, t_ns: ArrayLike) -> FloatArray:
         """Integrated transmission [ns] up to the times `t_ns` [ns] after the rising edge's half height."""
         t = np.asarray(t_ns, dtype=np.float64)
         if self.times_ns.size:

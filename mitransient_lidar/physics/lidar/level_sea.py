@@ -10,12 +10,11 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import Read
-from mitransient_lidar.core.validation import Checked, FloatArray, checked, finite_array, in_range, positive
+from mitransient_lidar.core.validation import ArrayLike, Checked, FloatArray, checked, finite_array, in_range, positive
 from mitransient_lidar.physics.lidar.pose import Pose
 
 #: Steps of Newton's method, and the relative change at which it ends.
@@ -34,7 +33,7 @@ class LevelSea:
     boundaries: tuple[float, ...] = ()
     group_index: tuple[float, ...] | None = None  #: Group indices of the layers; by default the refractive indices.
 
-    def lengths(self, depth: npt.ArrayLike, sine: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def lengths(self, depth: ArrayLike, sine: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return the optical length of rays from the sea level to depths, and the horizontal one over the sine [m].
 
         Depths [m] and sines of the angles from the vertical in the air broadcast; lengths to points in the air are 0.
@@ -47,7 +46,7 @@ class LevelSea:
             optical, horizontal = optical + group * index * length, horizontal + length
         return optical, horizontal
 
-    def at_height(self, origin: FloatArray, directions: npt.ArrayLike, z: npt.ArrayLike) -> FloatArray:
+    def at_height(self, origin: FloatArray, directions: ArrayLike, z: ArrayLike) -> FloatArray:
         """Return where rays from points in the air meet a height, in the air or in the water.
 
         Returns x, y [m], shape (..., 2); NaN for rays that do not go down.
@@ -63,7 +62,7 @@ class LevelSea:
         distance = (origin[..., 2] - np.maximum(level, 0)) / down + self.lengths(-level, sine)[1]
         return np.asarray(origin[..., :2] + rays[..., :2] * distance[..., None])
 
-    def crossing(self, origin: FloatArray, points: npt.ArrayLike) -> FloatArray:
+    def crossing(self, origin: FloatArray, points: ArrayLike) -> FloatArray:
         """Return where lines of sight from a point in the air to points cross the sea level.
 
         Lines to points in the air are prolonged straight to the sea level.
@@ -104,17 +103,17 @@ class LevelSea:
         return [np.clip(depth - top, 0, bottom - top) for top, bottom in itertools.pairwise(edges)]
 
 
-def snell(theta: npt.ArrayLike, n: float) -> FloatArray:
+def snell(theta: ArrayLike, n: float) -> FloatArray:
     """Refraction angle [rad] in water with relative index `n` >= 1 for angles `theta` [rad] in air."""
     return np.asarray(np.arcsin(np.sin(finite_array("theta", theta)) / in_range("n", n, 1, np.inf)))
 
 
-def cos_in_water(cosine: npt.ArrayLike, n: float) -> FloatArray:
+def cos_in_water(cosine: ArrayLike, n: float) -> FloatArray:
     """Return the cosines of refraction angles in water from the cosines in air, by Snell's law."""
     return np.asarray(np.sqrt(1 - (1 - np.asarray(cosine, dtype=np.float64) ** 2) / n**2))
 
 
-def turn_by_slope(theta: npt.ArrayLike, n: float) -> FloatArray:
+def turn_by_slope(theta: ArrayLike, n: float) -> FloatArray:
     """Return the angle by which a slope turns the refracted ray over the slope, 1 - cos(theta)/(n cos(phi))."""
     angle = np.asarray(theta, dtype=np.float64)
     return np.asarray(1 - np.cos(angle) / (n * np.sqrt(1 - (np.sin(angle) / n) ** 2)))
@@ -138,7 +137,7 @@ def refract_level(direction: FloatArray, n: float) -> FloatArray:
     return np.concatenate([horizontal, down], axis=-1)
 
 
-def fresnel(theta: npt.ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
+def fresnel(theta: ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
     """Power reflectance and transmittance of a smooth interface for unpolarised light.
 
     `theta`: incidence angle [rad], 0 to pi/2. `n`: index behind the interface relative to that before it; below 1 from
@@ -160,7 +159,7 @@ def fresnel(theta: npt.ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
     return reflectance, 1 - reflectance
 
 
-def solid_angle_per_area(height: npt.ArrayLike, depth: npt.ArrayLike, theta: npt.ArrayLike, n: float) -> FloatArray:
+def solid_angle_per_area(height: ArrayLike, depth: ArrayLike, theta: ArrayLike, n: float) -> FloatArray:
     """Solid angle in water per receiver area, at a point on the refracted ray.
 
     Returns d(omega)/dA [sr/m^2] for an aperture normal to the ray: 1/(S_s S_t) with the sagittal and tangential
@@ -176,7 +175,7 @@ def solid_angle_per_area(height: npt.ArrayLike, depth: npt.ArrayLike, theta: npt
     return np.asarray(1 / (sagittal * tangential))
 
 
-def surface_time_ns(height: npt.ArrayLike, theta: npt.ArrayLike) -> FloatArray:
+def surface_time_ns(height: ArrayLike, theta: ArrayLike) -> FloatArray:
     """Two-way time [ns] to the level surface from `height` [m] at the angle `theta` [rad]."""
     return np.asarray(2e9 * np.asarray(height, dtype=np.float64) / (C0 * np.cos(finite_array("theta", theta))))
 
@@ -246,24 +245,24 @@ class LidarGeometry(Checked):
         """Depth per nanosecond of delay [m/ns]: c0 cos(theta_water)/(2 n_g)."""
         return self.metres_per_ns * self.cos_water
 
-    def path_of_time(self, time_ns: npt.ArrayLike) -> FloatArray:
+    def path_of_time(self, time_ns: ArrayLike) -> FloatArray:
         """Return the one-way path in the water [m] of echoes at times [ns]."""
         return np.asarray(self.metres_per_ns * (finite_array("time_ns", time_ns) - self.surface_time_ns))
 
-    def depth_of_time(self, time_ns: npt.ArrayLike) -> FloatArray:
+    def depth_of_time(self, time_ns: ArrayLike) -> FloatArray:
         """Return the echo depth [m] for times [ns]."""
         return np.asarray((finite_array("time_ns", time_ns) - self.surface_time_ns) * self.depth_per_ns)
 
-    def time_of_depth(self, depth: npt.ArrayLike) -> FloatArray:
+    def time_of_depth(self, depth: ArrayLike) -> FloatArray:
         """Return the arrival times [ns] of echoes from depths [m]."""
         return np.asarray(self.surface_time_ns + finite_array("depth", depth) / self.depth_per_ns)
 
-    def solid_angle_per_area(self, path: npt.ArrayLike) -> FloatArray:
+    def solid_angle_per_area(self, path: ArrayLike) -> FloatArray:
         """Return the solid angle of the aperture per area [sr/m^2] at one-way paths in the water [m]."""
         depth = np.asarray(path, dtype=np.float64) * self.cos_water
         return solid_angle_per_area(self.height, depth, self.off_nadir, self.refractive_index)
 
-    def spreading(self, path: npt.ArrayLike) -> FloatArray:
+    def spreading(self, path: ArrayLike) -> FloatArray:
         """Return the solid angle of the aperture at paths in the water [m] over that at the surface; 1 above it."""
         return np.asarray(self.solid_angle_per_area(np.maximum(path, 0)) / self.solid_angle_per_area(0.0))
 
@@ -281,7 +280,7 @@ class LidarSystem(LidarGeometry):
     energy: float = checked(positive)
     aperture_area: float = checked(positive)  #: Area of the receiver normal to the ray [m^2], positive.
 
-    def water_gain(self, depth: npt.ArrayLike, theta: npt.ArrayLike) -> FloatArray:
+    def water_gain(self, depth: ArrayLike, theta: ArrayLike) -> FloatArray:
         """Received energy per unit of backscatter [J sr], without attenuation in the water.
 
         `depth`, `theta`: depth [m], at least 0, and angle of the ray in air [rad], which broadcast.

@@ -9,12 +9,11 @@ from os import PathLike
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables.headings import Column
 from mitransient_lidar.core.tables.text_tables import read_time_samples
-from mitransient_lidar.core.validation import FloatArray, non_negative, positive, time_samples
+from mitransient_lidar.core.validation import ArrayLike, BoolArray, FloatArray, non_negative, positive, time_samples
 from mitransient_lidar.physics.piecewise_linear import first_crossing, integral, locate, node_integrals
 
 logger = logging.getLogger(__name__)
@@ -56,7 +55,7 @@ class Pulse:
         return cls("gaussian", positive("fwhm_ns", fwhm_ns), np.zeros(0), np.zeros(0))
 
     @classmethod
-    def sampled(cls, times_ns: npt.ArrayLike, power: npt.ArrayLike) -> Pulse:
+    def sampled(cls, times_ns: ArrayLike, power: ArrayLike) -> Pulse:
         """Pulse given by samples.
 
         `times_ns`: strictly increasing times [ns], at least 2, shape (S,). They are shifted so that the (first) largest
@@ -106,7 +105,7 @@ class Pulse:
             return 3 * self.fwhm_ns, 3 * self.fwhm_ns
         return -float(self.times_ns[0]), float(self.times_ns[-1])
 
-    def cumulative(self, t_ns: npt.ArrayLike) -> FloatArray:
+    def cumulative(self, t_ns: ArrayLike) -> FloatArray:
         """Fraction of the energy that has left the transmitter by the times `t_ns` [ns]."""
         t = np.asarray(t_ns, dtype=np.float64)
         if self.shape == "gaussian":
@@ -168,7 +167,7 @@ class Pulse:
         return np.where(t < self.times_ns[0], 0, np.where(late > 0, after, inside))
 
 
-def waveform(energy: npt.ArrayLike, bin_width_ns: float, kernel: tuple[int, FloatArray]) -> FloatArray:
+def waveform(energy: ArrayLike, bin_width_ns: float, kernel: tuple[int, FloatArray]) -> FloatArray:
     """Received power from ideal echo energies.
 
     Parameters
@@ -222,7 +221,7 @@ def _convolved(padded: FloatArray, weights: FloatArray) -> FloatArray:
     return found
 
 
-def _reached(sources: npt.NDArray[np.bool_], size: int) -> npt.NDArray[np.bool_]:
+def _reached(sources: BoolArray, size: int) -> BoolArray:
     """Return the bins in which a kernel with some bins contains a share of any source."""
     known = np.concatenate([np.zeros(size, dtype=np.int64), np.cumsum(sources)])
     return np.asarray(known[size:] > known[: sources.size])

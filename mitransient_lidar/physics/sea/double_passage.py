@@ -16,9 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import ArrayLike, FloatArray
 from mitransient_lidar.physics.lidar.level_sea import turn_by_slope
 from mitransient_lidar.physics.sea.wave_spectrum import SeaState, WaveSpectrum
 
@@ -47,7 +46,7 @@ class SlopeStructure:
     along: FloatArray
     across: FloatArray
 
-    def enhancement(self, spread: npt.ArrayLike, displacement: npt.ArrayLike) -> FloatArray:
+    def enhancement(self, spread: ArrayLike, displacement: ArrayLike) -> FloatArray:
         """Return the enhancement g [1].
 
         `spread`: displacement of a ray over the slope that causes it [m], a depth times a factor below 1; any shape.
@@ -84,7 +83,7 @@ class EnhancementTable:
         spreads = spread_per_depth * depths[:, None]
         return cls(depths, structure.enhancement(spreads, _DISPLACEMENTS))
 
-    def at(self, depth: npt.ArrayLike, displacement: npt.ArrayLike) -> FloatArray:
+    def at(self, depth: ArrayLike, displacement: ArrayLike) -> FloatArray:
         """Return enhancements at depths and displacements [m], arrays that broadcast.
 
         They are linear in the logarithms of depth and displacement, and constant beyond the table. Above its first

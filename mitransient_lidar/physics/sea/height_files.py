@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.array_files import check_size, read_netcdf
@@ -62,7 +61,7 @@ def length_unit(name: str, unit: str) -> float:
 
 def heights_in_metres(
     path: Path,
-    values: npt.NDArray[np.float64],
+    values: FloatArray,
     stated: Stated,
     sign: str | None = None,
     unit: str | None = None,

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.array_files import Array, read_exr, read_npy, read_npz, readable_suffix
 from mitransient_lidar.core.maps import Grid, MapSystem, read_ascii_grid, read_bag, read_geotiff
-from mitransient_lidar.core.validation import FloatArray, IntArray, finite, positive
+from mitransient_lidar.core.validation import ArrayLike, BoolArray, FloatArray, IntArray, finite, positive
 from mitransient_lidar.physics.piecewise_linear import locate
 from mitransient_lidar.physics.sea.height_files import (
     UNEVENNESS,
@@ -46,10 +45,10 @@ class HeightMap:
     x: FloatArray  #: Column positions [m], increasing, at least 2.
     y: FloatArray  #: Row positions [m], increasing, at least 2.
     origin: tuple[float, float] | None = None  #: Point of the map at x = y = 0 [m], if it is in map coordinates.
-    filled: npt.NDArray[np.bool_] | None = None  #: Cells without a value of their own, in the shape of the heights.
+    filled: BoolArray | None = None  #: Cells without a value of their own, in the shape of the heights.
     system: MapSystem | None = None  #: Coordinate system of the file, if it states one.
 
-    def covers(self, x: npt.ArrayLike, y: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def covers(self, x: ArrayLike, y: ArrayLike) -> BoolArray:
         """Return whether locations x, y [m], in one shape, are in map cells with a value of their own."""
         inside, nearest = [], []
         for wanted, positions in ((x, self.x), (y, self.y)):
@@ -60,7 +59,7 @@ class HeightMap:
         known = True if self.filled is None else ~self.filled[nearest[1], nearest[0]]
         return np.asarray(inside[0] & inside[1] & known)
 
-    def sample(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+    def sample(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """Return the elevation on grid lines by bilinear interpolation.
 
         Parameters
@@ -229,7 +228,7 @@ def _superfluous_size(path: Path, size: float) -> UserError:
 
 def _without_holes(
     path: Path, heights: FloatArray, spacing: tuple[float, float], treatment: str
-) -> tuple[FloatArray, npt.NDArray[np.bool_] | None]:
+) -> tuple[FloatArray, BoolArray | None]:
     """Return the heights with holes filled from the nearest cell, and where; refuse holes that are not to be filled."""
     empty = ~np.isfinite(heights)
     count = int(empty.sum())
@@ -308,7 +307,7 @@ def _even_positions(path: Path, name: str, values: Array, count: int) -> FloatAr
     return positions
 
 
-def _cells(positions: FloatArray, wanted: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
+def _cells(positions: FloatArray, wanted: ArrayLike) -> tuple[IntArray, FloatArray]:
     """Return the cells of the wanted positions, and the relative position in each, 0 to 1."""
     index, distance = locate(positions, np.asarray(wanted, dtype=np.float64))
     return index, distance / (positions[index + 1] - positions[index])

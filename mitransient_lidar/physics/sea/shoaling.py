@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import ArrayLike, FloatArray
 from mitransient_lidar.physics.sea.realization import PeriodicHeights
 from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.wind_spectra import ShallowSpectrum, SwellSpectrum
@@ -126,7 +125,7 @@ def _factor(wind: CosineSpectrum, k: FloatArray, depth: float) -> FloatArray:
     return np.sqrt(np.divide(shallow, deep, out=np.zeros_like(deep), where=deep > 0))
 
 
-def _smooth_minimum(one: npt.ArrayLike, other: npt.ArrayLike) -> FloatArray:
+def _smooth_minimum(one: ArrayLike, other: ArrayLike) -> FloatArray:
     """Return the smooth minimum of positive numbers, which may be infinite."""
     a, b = np.asarray(one, dtype=np.float64), np.asarray(other, dtype=np.float64)
     low, high = np.minimum(a, b), np.maximum(a, b)

@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, IntArray, non_negative, positive
+from mitransient_lidar.core.validation import ArrayLike, FloatArray, IntArray, non_negative, positive
 
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
@@ -27,7 +26,7 @@ _LARGEST_FRACTION = 0.75  # of the slope variance on one axis: by the angular de
 _NO_WAVES = 1e-6  # fraction of the given slope variance below which a spectrum is made flat instead of scaled
 
 
-def phase_speed(k: npt.ArrayLike) -> FloatArray:
+def phase_speed(k: ArrayLike) -> FloatArray:
     """Phase speed [m/s] of gravity-capillary waves with wavenumber `k` [rad/m], positive, in deep water."""
     wavenumber = np.asarray(k, dtype=np.float64)
     return np.asarray(np.sqrt(GRAVITY / wavenumber * (1 + (wavenumber / SLOWEST_WAVENUMBER) ** 2)))
@@ -54,7 +53,7 @@ class WaveSpectrum(ABC):
         """Wavenumber of the spectral peak [rad/m]; infinite for a flat sea."""
 
     @abstractmethod
-    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+    def omnidirectional(self, k: ArrayLike) -> FloatArray:
         """Omnidirectional elevation spectrum S [m^3] at wavenumbers `k` [rad/m], 0 at k <= 0.
 
         Its integral over k > 0 is the elevation variance.
@@ -76,7 +75,7 @@ class WaveSpectrum(ABC):
         return (self,)
 
     @abstractmethod
-    def spreading(self, k: npt.ArrayLike) -> FloatArray:
+    def spreading(self, k: ArrayLike) -> FloatArray:
         """Anisotropy Delta(k) = 2 <cos 2 phi> [1], -2 to 2, at wavenumbers `k` [rad/m] above 0.
 
         The slope variance is k^2 S (1/2 +- Delta/4) along and across the direction, from which phi is measured;
@@ -170,7 +169,7 @@ class SeaState:
         """Peak wavenumber [rad/m] of the component with the highest waves."""
         return max(self.components, key=lambda component: component.elevation_variance()).peak_wavenumber
 
-    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+    def omnidirectional(self, k: ArrayLike) -> FloatArray:
         """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
         return np.asarray(sum(component.omnidirectional(k) for component in self.components))
 
@@ -209,13 +208,6 @@ class MatchedSpectrum(CosineSpectrum):
     scaled, positive. If the others alone have too much slope variance, or a ratio that scaling cannot correct, it is
     reduced in steps of a tenth. Below the longest wave all are scaled.
 
-    Attributes
-    ----------
-    scaled_from : float
-        Wavenumber above which waves are scaled [rad/m].
-    scales : tuple of float
-        Factors along and across the direction [1].
-
     Notes
     -----
     With the fractions 1/2 +- Delta/4 of the slope variance k^2 S, factors s_u and s_c give
@@ -228,8 +220,8 @@ class MatchedSpectrum(CosineSpectrum):
     crosswind: float
     k_from: float = 2 * np.pi
     direction: float = field(init=False)
-    scaled_from: float = field(init=False)
-    scales: tuple[float, float] = field(init=False)
+    scaled_from: float = field(init=False)  #: Wavenumber above which waves are scaled [rad/m].
+    scales: tuple[float, float] = field(init=False)  #: Factors along and across the direction [1].
 
     def __post_init__(self) -> None:
         if not isinstance(self.spectrum, CosineSpectrum):
@@ -259,7 +251,7 @@ class MatchedSpectrum(CosineSpectrum):
             ranges = tuple(sorted({*ranges, self.scaled_from}))
         return ranges
 
-    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+    def omnidirectional(self, k: ArrayLike) -> FloatArray:
         """Omnidirectional elevation spectrum S'(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
         wavenumber = np.asarray(k, dtype=np.float64)
         density = self.spectrum.omnidirectional(wavenumber)
@@ -268,7 +260,7 @@ class MatchedSpectrum(CosineSpectrum):
             wavenumber > self.scaled_from, density * (self.scales[0] * up + self.scales[1] * cross), density
         )
 
-    def spreading(self, k: npt.ArrayLike) -> FloatArray:
+    def spreading(self, k: ArrayLike) -> FloatArray:
         """Upwind-crosswind ratio Delta'(k) [1], -1 to 1; see `WaveSpectrum.spreading`."""
         wavenumber = np.asarray(k, dtype=np.float64)
         up, cross = self._fractions(wavenumber)

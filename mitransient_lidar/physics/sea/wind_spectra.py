@@ -10,10 +10,9 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, IntArray, finite, in_range, non_negative, positive
+from mitransient_lidar.core.validation import ArrayLike, FloatArray, IntArray, finite, in_range, non_negative, positive
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
 from mitransient_lidar.physics.sea.wave_spectrum import (
     GRAVITY,
@@ -62,7 +61,7 @@ class WindSpectrum(CosineSpectrum):
         in_range("wind_speed", self.wind_speed, 0, MAX_WIND_SPEED)
         finite("direction", self.direction)
 
-    def spreading(self, k: npt.ArrayLike) -> FloatArray:
+    def spreading(self, k: ArrayLike) -> FloatArray:
         """Upwind-crosswind ratio Delta(k) [1], 0 to 1 (eq. 57); see `WaveSpectrum.spreading`."""
         if self.wind_speed == 0:
             return np.zeros(np.shape(k))
@@ -105,7 +104,7 @@ class ElfouhailySpectrum(WindSpectrum):
         """First and last wavenumber [rad/m] with waves: the capillary peak has fallen to e^-90 at the last."""
         return self.peak_wavenumber / 10, 20 * SLOWEST_WAVENUMBER
 
-    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+    def omnidirectional(self, k: ArrayLike) -> FloatArray:
         """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
         wavenumber = np.asarray(k, dtype=np.float64)
         valid = wavenumber > 0
@@ -149,7 +148,7 @@ class SaturatedSpectrum(WindSpectrum):
             return ()
         return self.peak_wavenumber / 10, self.peak_wavenumber, self.CUT_OFF
 
-    def _saturated(self, k: npt.ArrayLike, alpha: float, enhancement: float) -> FloatArray:
+    def _saturated(self, k: ArrayLike, alpha: float, enhancement: float) -> FloatArray:
         """S(k) [m^3] with the Phillips constant `alpha` and the JONSWAP peak enhancement."""
         wavenumber, peak = np.asarray(k, dtype=np.float64), self.peak_wavenumber
         valid = (wavenumber > 0) & (wavenumber <= self.CUT_OFF)
@@ -183,7 +182,7 @@ class PiersonMoskowitzSpectrum(SaturatedSpectrum):
             return np.inf
         return GRAVITY * math.sqrt(0.8 * _PIERSON_MOSKOWITZ_BETA) / (1.026 * self.wind_speed) ** 2
 
-    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+    def omnidirectional(self, k: ArrayLike) -> FloatArray:
         """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
         return self._saturated(k, 8.1e-3, 1.0)
 
@@ -228,7 +227,7 @@ class JonswapSpectrum(SaturatedSpectrum):
         """Wavenumber at the frequency spectrum's peak [rad/m]."""
         return GRAVITY * (22 / self.wind_speed) ** 2 / math.pow(self._relative_fetch, 2 / 3)
 
-    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+    def omnidirectional(self, k: ArrayLike) -> FloatArray:
         """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
         return self._saturated(k, 0.076 * self._relative_fetch**-0.22, self.peak_enhancement)
 
@@ -268,13 +267,13 @@ class ShallowSpectrum(CosineSpectrum):
         """See `WaveSpectrum.smooth_ranges`."""
         return tuple(self._shallow(edge) for edge in self.deep.smooth_ranges)
 
-    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+    def omnidirectional(self, k: ArrayLike) -> FloatArray:
         """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
         wavenumber = np.asarray(k, dtype=np.float64)
         ratio = np.tanh(np.maximum(wavenumber, 0) * self.depth)
         return np.asarray(ratio**3 * self.deep.omnidirectional(wavenumber * ratio))
 
-    def spreading(self, k: npt.ArrayLike) -> FloatArray:
+    def spreading(self, k: ArrayLike) -> FloatArray:
         """Anisotropy Delta(k) [1]; see `WaveSpectrum.spreading`."""
         wavenumber = np.asarray(k, dtype=np.float64)
         return self.deep.spreading(wavenumber * np.tanh(wavenumber * self.depth))
@@ -329,7 +328,7 @@ class SwellSpectrum(WaveSpectrum):
         reach = _REACH * self.relative_bandwidth
         return self.peak_wavenumber * max(1 - reach, 1e-6), self.peak_wavenumber * (1 + reach)
 
-    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+    def omnidirectional(self, k: ArrayLike) -> FloatArray:
         """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
         wavenumber = np.asarray(k, dtype=np.float64)
         low, high = self.smooth_ranges
@@ -340,12 +339,12 @@ class SwellSpectrum(WaveSpectrum):
         hump = scale * np.exp(-(((wavenumber - self.peak_wavenumber) / width) ** 2) / 2)
         return np.asarray(np.where((wavenumber > low) & (wavenumber < high), hump, 0))
 
-    def spreading(self, k: npt.ArrayLike) -> FloatArray:
+    def spreading(self, k: ArrayLike) -> FloatArray:
         """Anisotropy Delta [1], the same for all waves; see `WaveSpectrum.spreading`."""
         angle, weight = self._angles(2000)
         return np.full(np.shape(k), 2 * float(np.sum(weight * np.cos(2 * angle))))
 
-    def directional(self, kx: npt.ArrayLike, ky: npt.ArrayLike) -> FloatArray:
+    def directional(self, kx: ArrayLike, ky: ArrayLike) -> FloatArray:
         """Directional spectrum Psi [m^4] at wavenumber components [rad/m] that broadcast, equal for opposite waves."""
         cos, sin = np.cos(self.direction), np.sin(self.direction)
         along = cos * np.asarray(kx) + sin * np.asarray(ky)

@@ -11,12 +11,11 @@ from functools import cache
 from importlib import resources
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite, in_range
+from mitransient_lidar.core.validation import ArrayLike, FloatArray, finite, in_range
 
-PhaseFunction = Callable[[npt.ArrayLike], FloatArray]
+PhaseFunction = Callable[[ArrayLike], FloatArray]
 """Function from scattering angles [rad] to the phase function [1/sr]."""
 
 
@@ -39,7 +38,7 @@ def log_log_interpolation(
     """
     log_theta, log_p = np.log(theta), np.log(values)
 
-    def interpolated(angle: npt.ArrayLike) -> FloatArray:
+    def interpolated(angle: ArrayLike) -> FloatArray:
         with np.errstate(divide="ignore"):
             x = np.log(np.asarray(angle, dtype=np.float64))
         below = extrapolation(np.minimum(x - log_theta[0], 0))
@@ -75,7 +74,7 @@ _BISECTIONS = 52
 """Halvings of this range that leave the rounding error."""
 
 
-def fournier_forand(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray:
+def fournier_forand(theta: ArrayLike, n: float, mu: float) -> FloatArray:
     """Fournier-Forand phase function.
 
     Parameters
@@ -115,7 +114,7 @@ def fournier_forand(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray:
     return np.asarray(core + tail)
 
 
-def fournier_forand_cdf(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray:
+def fournier_forand_cdf(theta: ArrayLike, n: float, mu: float) -> FloatArray:
     """Fraction of light scattered by less than `theta` with a Fournier-Forand phase function.
 
     Returns cumulative fraction, 0 at 0 and 1 at pi. Fournier and Jonasz (1999), Proc. SPIE 3761, 62.
@@ -191,7 +190,7 @@ def petzold_average_particle() -> PhaseFunction:
     return log_log_phase(degrees, values, power=-1.346)
 
 
-def _half_angle(theta: npt.ArrayLike) -> FloatArray:
+def _half_angle(theta: ArrayLike) -> FloatArray:
     """Return s = sin^2(theta/2)."""
     return np.asarray(np.sin(np.asarray(theta, dtype=np.float64) / 2) ** 2)
 

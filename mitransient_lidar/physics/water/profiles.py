@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path
@@ -16,7 +15,7 @@ from mitransient_lidar.core.formats.array_files import read_netcdf, readable_suf
 from mitransient_lidar.core.maps import NO_DATA, undeclared_no_data
 from mitransient_lidar.core.tables.headings import METRES, PER_METRE, UNITLESS, Column, read_headings
 from mitransient_lidar.core.tables.text_tables import complete_rows, read_table
-from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
+from mitransient_lidar.core.validation import BoolArray, FloatArray, finite_array, in_range
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import PETZOLD_BACKSCATTER_RATIO
 
@@ -402,7 +401,7 @@ def _absorption_scattering(columns: _Columns) -> tuple[FloatArray, FloatArray]:
     return a, b
 
 
-def _require(valid: npt.NDArray[np.bool_], text: str, *values: FloatArray) -> None:
+def _require(valid: BoolArray, text: str, *values: FloatArray) -> None:
     """Reject the first invalid row, with its values in the text."""
     for row in np.flatnonzero(~valid)[:1]:
         raise _RowError(int(row), text.format(*(column[row] for column in values)))

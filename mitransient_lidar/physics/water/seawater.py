@@ -6,10 +6,9 @@ Every function takes numbers or arrays that broadcast and returns an array of th
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.constants import AVOGADRO, BOLTZMANN
-from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
+from mitransient_lidar.core.validation import ArrayLike, FloatArray, finite_array, in_range
 from mitransient_lidar.physics.water.phase import read_columns
 
 WAVELENGTH_RANGE = (400.0, 1100.0)
@@ -36,9 +35,7 @@ _RESONANCES = (
 )
 
 
-def refractive_index(
-    wavelength_nm: npt.ArrayLike, temperature: npt.ArrayLike = 20.0, salinity: npt.ArrayLike = 35.0
-) -> FloatArray:
+def refractive_index(wavelength_nm: ArrayLike, temperature: ArrayLike = 20.0, salinity: ArrayLike = 35.0) -> FloatArray:
     """Refractive index of sea water relative to air.
 
     Parameters
@@ -69,9 +66,7 @@ def refractive_index(
     return np.asarray(np.where(lam <= VISIBLE_RANGE[1], visible, visible - _quan_fry(lam, 20, 0) + _pure_index(lam)))
 
 
-def group_index(
-    wavelength_nm: npt.ArrayLike, temperature: npt.ArrayLike = 20.0, salinity: npt.ArrayLike = 35.0
-) -> FloatArray:
+def group_index(wavelength_nm: ArrayLike, temperature: ArrayLike = 20.0, salinity: ArrayLike = 35.0) -> FloatArray:
     """Group index of sea water relative to air, which determines travel times.
 
     Parameters
@@ -92,7 +87,7 @@ def group_index(
     return np.asarray(np.where(lam <= VISIBLE_RANGE[1], visible, visible + pure))
 
 
-def water_absorption(wavelength_nm: npt.ArrayLike) -> FloatArray:
+def water_absorption(wavelength_nm: ArrayLike) -> FloatArray:
     """Absorption coefficient of pure water.
 
     Returns the absorption [1/m], linear between tabulated values, 2.5 nm apart up to 700 nm and 1 to 3 nm from 705 nm.
@@ -114,9 +109,9 @@ def water_absorption(wavelength_nm: npt.ArrayLike) -> FloatArray:
 
 
 def water_scattering(
-    wavelength_nm: npt.ArrayLike,
-    temperature: npt.ArrayLike = 20.0,
-    salinity: npt.ArrayLike = 35.0,
+    wavelength_nm: ArrayLike,
+    temperature: ArrayLike = 20.0,
+    salinity: ArrayLike = 35.0,
     depolarisation: float = DEPOLARISATION,
 ) -> FloatArray:
     """Scattering coefficient of sea water without particles.
@@ -150,7 +145,7 @@ def water_scattering(
     return np.asarray(8 * np.pi / 3 * beta_90 * (2 + delta) / (1 + delta))
 
 
-def water_phase_function(theta: npt.ArrayLike, depolarisation: float = DEPOLARISATION) -> FloatArray:
+def water_phase_function(theta: ArrayLike, depolarisation: float = DEPOLARISATION) -> FloatArray:
     """Phase function of water molecules, 3 / (4 pi (3 + p)) (1 + p cos^2(theta)) with p = (1 - delta) / (1 + delta).
 
     Returns the phase function [1/sr], in the shape of `theta`.
@@ -164,7 +159,7 @@ def water_phase_function(theta: npt.ArrayLike, depolarisation: float = DEPOLARIS
 
 
 def _state(
-    wavelength_nm: npt.ArrayLike, temperature: npt.ArrayLike, salinity: npt.ArrayLike
+    wavelength_nm: ArrayLike, temperature: ArrayLike, salinity: ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return valid wavelength, temperature and salinity."""
     return (
@@ -174,7 +169,7 @@ def _state(
     )
 
 
-def _within(name: str, values: npt.ArrayLike, limits: tuple[float, float]) -> FloatArray:
+def _within(name: str, values: ArrayLike, limits: tuple[float, float]) -> FloatArray:
     """Return finite values within limits."""
     array = finite_array(name, values)
     for bad in array[(array < limits[0]) | (array > limits[1])][:1]:

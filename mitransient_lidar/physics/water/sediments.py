@@ -16,10 +16,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import Checked, FloatArray, checked, in_range, is_number, shown
+from mitransient_lidar.core.validation import ArrayLike, Checked, FloatArray, checked, in_range, is_number, shown
 from mitransient_lidar.physics.water.phase import read_columns
 
 #: Bottoms and land in the order of their table columns.
@@ -52,7 +51,7 @@ class HapkeSurface(Checked):
     opposition_amplitude: float = checked(in_range, 0, 3, default=1.0)
     opposition_width: float = checked(in_range, 1e-3, 1, default=0.06)  #: Its half width h [rad], 0.001 to 1.
 
-    def h_function(self, cosine: npt.ArrayLike) -> FloatArray:
+    def h_function(self, cosine: ArrayLike) -> FloatArray:
         """Return Hapke's approximation of Chandrasekhar's H function, within 1 %, at cosines 0 to 1."""
         x = np.maximum(np.asarray(cosine, dtype=np.float64), 1e-12)
         r0 = self.diffusive_reflectance
@@ -64,7 +63,7 @@ class HapkeSurface(Checked):
         gamma = math.sqrt(1 - self.albedo)
         return (1 - gamma) / (1 + gamma)
 
-    def single_scattering(self, half_sine_squared: npt.ArrayLike) -> FloatArray:
+    def single_scattering(self, half_sine_squared: ArrayLike) -> FloatArray:
         """Return [1 + B(g)] p(g) at phase angles given by sin^2(g/2), 0 to 1; p has the mean 1 over the sphere."""
         s = np.asarray(half_sine_squared, dtype=np.float64)
         b = self.lobe_asymmetry
@@ -74,7 +73,7 @@ class HapkeSurface(Checked):
         backward, forward = ((1 - b * b) / ((1 - b) ** 2 + 4 * b * part) ** 1.5 for part in (s, 1 - s))
         return np.asarray((1 + surge) * (self.backward_share * backward + (1 - self.backward_share) * forward))
 
-    def brdf(self, cos_in: npt.ArrayLike, cos_out: npt.ArrayLike, phase_angle: npt.ArrayLike) -> FloatArray:
+    def brdf(self, cos_in: ArrayLike, cos_out: ArrayLike, phase_angle: ArrayLike) -> FloatArray:
         """Return f [1/sr] at cosines of incidence and reflection, above 0 to 1, and phase angles [rad]."""
         mu_i, mu_o = (np.asarray(value, dtype=np.float64) for value in (cos_in, cos_out))
         once = self.single_scattering(np.sin(0.5 * np.asarray(phase_angle, dtype=np.float64)) ** 2)

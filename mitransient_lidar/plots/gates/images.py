@@ -11,7 +11,6 @@ from typing import Any, Literal, NamedTuple
 
 import matplotlib
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
 from matplotlib.axes import Axes
@@ -22,7 +21,7 @@ from matplotlib.image import AxesImage
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
-from mitransient_lidar.core.validation import FloatArray, integer
+from mitransient_lidar.core.validation import BoolArray, FloatArray, integer
 from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.results.gate_stack import as_stack
 from mitransient_lidar.results.geometry import optional_number
@@ -180,7 +179,7 @@ def unit_of(stack: xr.Dataset, largest: float) -> tuple[float, str]:
     return factor, f"{prefix}J"
 
 
-def reached_by_surface(stack: xr.Dataset) -> npt.NDArray[np.bool_]:
+def reached_by_surface(stack: xr.Dataset) -> BoolArray:
     """Return which gates open before the end of the surface echo in a lit pixel; none if its time is unknown."""
     surface = optional_number(stack.attrs, "surface_time_ns")
     if surface is None:

@@ -91,8 +91,6 @@ def figures(
     target_error
         Relative standard error of the median bin, greater than 0. Figure 4, which converges slowly, may miss it, with a
         warning.
-    progress
-        Called with a `passes.Progress` after every batch of shots.
 
     Returns
     -------

@@ -93,8 +93,6 @@ def render_frames(
         Passes per image, 2 to 10 000. Each renders one pulse, at its own time, drawn from its own part of the image's
         pulses (`GateSequence.sampled_pulse`): the mean over them is unbiased. Standard errors come from the spread of
         the passes; for images with many pulses they are at most too large, as they include the change in the sea.
-    progress
-        Called with a `passes.Progress` after every few images.
 
     Returns
     -------

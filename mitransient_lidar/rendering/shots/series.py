@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError, is_interruption
@@ -30,7 +29,7 @@ from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 from mitransient_lidar.core.tables.headings import Column
 from mitransient_lidar.core.tables.text_tables import read_two_columns
 from mitransient_lidar.core.tables.written import table_lines
-from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range, integer
+from mitransient_lidar.core.validation import ArrayLike, FloatArray, IntArray, finite_array, in_range, integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.catalogue import with_infrared
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene
@@ -115,7 +114,7 @@ def render_shots(
     seed: Annotated[int, Option("Seed of random places, by default 1", 0, 2**53)] = 1,
     first_seed: int = 0,
     axis: TimeAxis | None = None,
-    shot_passes: npt.ArrayLike | None = None,
+    shot_passes: ArrayLike | None = None,
     components: Components = None,
     derivatives: Sequence[str] | str | None = None,
     instrument: Instrument = None,
@@ -140,8 +139,6 @@ def render_shots(
     move_target
         Whether the target keeps its position relative to the aim; the scene needs the parameters ``target_x`` and
         ``target_y``.
-    passes
-        Passes of each shot, 2 to 10 000; by default 8. With a `target_error`, the most, by default 400.
     target_error
         Relative standard error, greater than 0, at most 1, that ends a batch's passes, after at least 4 of them. The
         median over the bins of lit pixels from the surface echo to the end of the bottom echo must have reached it.
@@ -166,14 +163,10 @@ def render_shots(
         again.
     derivatives
         Names of parameters by which the light is differentiated, as for `rendering.render.render`.
-    infrared
-        Whether to render the infrared channel of the instrument at the same places, too, as for `render`.
     describe_sea
         Whether to add the attribute ``slope_deviation``, which takes 0.2 s.
     merge_unsuited
         Whether to merge the light of a scene that maps do not suit, or with a target in the light of a shot.
-    progress
-        Called with a `passes.Progress` after every batch of shots.
 
     Returns
     -------
@@ -332,7 +325,7 @@ def describe_shots(series: xr.Dataset) -> list[str]:
     return table_lines(columns, zip(series["shot"].values, *values.values(), peak, strict=True))
 
 
-def _checked_places(places: npt.ArrayLike) -> FloatArray:
+def _checked_places(places: ArrayLike) -> FloatArray:
     """Return places [m], shape (shots, 2)."""
     pairs = finite_array("positions", places)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not 1 <= len(pairs) <= 100_000:
@@ -343,7 +336,7 @@ def _checked_places(places: npt.ArrayLike) -> FloatArray:
     return pairs
 
 
-def _checked_passes(given: npt.ArrayLike | None, shots: int, passes: int) -> IntArray:
+def _checked_passes(given: ArrayLike | None, shots: int, passes: int) -> IntArray:
     """Return each shot's most passes."""
     if given is None:
         return np.full(shots, passes)

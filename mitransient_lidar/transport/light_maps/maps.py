@@ -21,34 +21,19 @@ _STEPS = 6
 
 @dataclass(frozen=True)
 class HeightFields:
-    """Heights of the sea on square cells about the place of each shot; beyond them the sea is as at their edge.
-
-    Attributes
-    ----------
-    values
-        Heights of all shots [m], one shot and then one line along x after the other.
-    lines
-        Number of lines on each side.
-    per_metre
-        Cells per metre [1/m].
-    wind
-        Direction of the first axis of the ripples among the shapes, unit vector (x, y).
-    low, displacement, turn
-        First x and y of each shot's cells among the shapes [m], and its displacement and turn as of `ScenePart`.
-    start
-        Number of the first height of each shot.
-    """
+    """Heights of the sea on square cells about the place of each shot; beyond them the sea is as at their edge."""
 
     OF_SHOTS = ("low", "displacement", "turn", "start")
 
-    values: mi.Float
-    lines: mi.UInt32
-    per_metre: mi.Float
-    wind: tuple[mi.Float, mi.Float]
+    values: mi.Float  #: Heights of all shots [m], one shot and then one line along x after the other.
+    lines: mi.UInt32  #: Number of lines on each side.
+    per_metre: mi.Float  #: Cells per metre [1/m].
+    wind: tuple[mi.Float, mi.Float]  #: Direction of the first axis of the ripples among the shapes, unit vector (x, y).
+    #: First x and y of each shot's cells among the shapes [m], and its displacement and turn as of `ScenePart`.
     low: mi.Vector2f
     displacement: mi.Vector3f
     turn: mi.Vector2f
-    start: mi.UInt32
+    start: mi.UInt32  #: Number of the first height of each shot.
 
     @classmethod
     def of_patches(
@@ -155,25 +140,14 @@ FEWEST_CELLS = 48
 
 @dataclass(frozen=True)
 class Planes:
-    """Horizontal planes at equal distances, the first at the mean sea level, and the maps on them.
+    """Horizontal planes at equal distances, the first at the mean sea level, and the maps on them."""
 
-    Attributes
-    ----------
-    depths
-        Depths [m], 0 first.
-    half
-        Half widths of the maps [m].
-    absorbed, scattered
-        Optical depths of absorption and scattering along the receiver's axis [1].
-    cells
-        Cells on each side of the maps.
-    """
-
-    depths: FloatArray
-    half: FloatArray
+    depths: FloatArray  #: Depths [m], 0 first.
+    half: FloatArray  #: Half widths of the maps [m].
+    #: Optical depths of absorption and scattering along the receiver's axis [1].
     absorbed: FloatArray
     scattered: FloatArray
-    cells: int = FEWEST_CELLS
+    cells: int = FEWEST_CELLS  #: Cells on each side of the maps.
 
     @classmethod
     def of_scene(cls, scene: LidarScene, deepest: float, count: int) -> Planes:

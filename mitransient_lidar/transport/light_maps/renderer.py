@@ -133,30 +133,18 @@ class _Rays:
 
 @dataclass
 class _Seen:
-    """Rays of the view in the water, and what they meet there.
+    """Rays of the view in the water, and what they meet there."""
 
-    Attributes
-    ----------
-    rays, pixel
-        The rays, and the pixel of each.
-    surface_length
-        Relative optical length by the point of the sea to the transmitter [m].
-    to_bed, bed, solid
-        Distance to the bottom [m], place there, and number of the solid.
-    slope
-        Slopes of the bottom along x and y, 0 on steep sides.
-    turned
-        Reflected radiance over the energy through a horizontal area [1/sr].
-    """
-
+    #: The rays, and the pixel of each.
     rays: _Rays
     pixel: mi.UInt32
-    surface_length: mi.Float
+    surface_length: mi.Float  #: Relative optical length by the point of the sea to the transmitter [m].
+    #: Distance to the bottom [m], place there, and number of the solid.
     to_bed: mi.Float
     bed: mi.Point3f
     solid: mi.UInt32
-    slope: mi.Vector2f
-    turned: mi.Float
+    slope: mi.Vector2f  #: Slopes of the bottom along x and y, 0 on steep sides.
+    turned: mi.Float  #: Reflected radiance over the energy through a horizontal area [1/sr].
 
 
 class UnsuitedError(UserError):

@@ -7,6 +7,7 @@ from typing import get_args, get_origin
 import pytest
 
 from mitransient_lidar.campaigns.design import Campaign
+from mitransient_lidar.core import options
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Plan, parts
 from mitransient_lidar.flights.plan import FlightPlan
@@ -86,3 +87,17 @@ def test_each_key_is_read_refused_and_documented_by_its_declaration(plan):
         plan.of({**usual_table, "colour": 3}, "the table")
     with pytest.raises(UserError, match=r"^the table = 3 must be a table$"):
         plan.of(3, "the table")
+
+
+def test_options_named_by_their_module_are_checked():
+    """And types in modules that checkers alone import are left."""
+
+    def drawn(seed=0, table=None):
+        """Draw."""
+        return seed
+
+    drawn.__annotations__ = {"seed": "options.Seed", "table": "frames.Table"}
+    assert options.checked(drawn)(3, table=4) == 3
+    assert "Random seed" in options.checked(drawn).__doc__
+    with pytest.raises(UserError, match="seed = -1 must lie between 0"):
+        options.checked(drawn)(-1)
