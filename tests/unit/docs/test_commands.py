@@ -103,7 +103,7 @@ def test_example_files_are_those_of_the_text() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["README.md", "docs/guide/gated_cameras.md"])
+@pytest.mark.parametrize("page", ["README.md", pytest.param("docs/guide/gated_cameras.md", marks=pytest.mark.long)])
 def test_commands_run_in_order(page, tmp_path, monkeypatch) -> None:
     """With two passes and few pixels: every command finds its files, and replaces none of an earlier one."""
     monkeypatch.chdir(tmp_path)
