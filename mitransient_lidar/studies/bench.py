@@ -26,6 +26,7 @@ from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.loading.catalogue import instrument_names, scene_text
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.loading.variants import alone
+from mitransient_lidar.rendering.passes import LIGHT, LightOption
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.transport.paths.passes import PassRenderer
 from mitransient_lidar.transport.rng import pass_streams
@@ -145,6 +146,7 @@ def run(
     json: Annotated[bool, Option("Print JSON")] = False,
     case: Annotated[str | None, Option("Run only this case")] = None,
     images: Annotated[bool, Option("Time a gate of 4 to 65536 pixels to 10 % instead")] = False,
+    light: LightOption = "merging",
     beams: Annotated[bool, Option("Compare beams from 0.1 to 20 mrad in all views instead")] = False,
     target_error: Annotated[
         float | None,
@@ -161,13 +163,16 @@ def run(
     errors has reached it, or after `max_time`, above 0 [s], by default 120 s. A `max_time` alone ends them, too.
 
     Images: the table system over a bottom at 8 m below a sea at 3 m/s, c = 0.3 /m, 64 gates of 10 ns, 1.5 ns apart. A
-    render ends when the gate on the bottom is known to 10 %. Beams: the table system over a bottom at 8 m, 2x2 pixels,
-    1 ns bins, a flat sea with 6 m/s ripples or 6 m/s waves.
+    render ends when the gate on the bottom is known to 10 %; `light` as for `rendering.render.render`. Beams: the table
+    system over a bottom at 8 m, 2x2 pixels, 1 ns bins, a flat sea with 6 m/s ripples or 6 m/s waves.
     """
+    if light != LIGHT[0] and not images:
+        raise UserError(f"light = {light!r} needs images = True")
     if images and beams:
         raise UserError("images = True and beams = True are alternatives: give one of them")
     if images:
-        _run_processes("images", ("layout",), {(one,): {"layout": one} for one in LAYOUTS}, _IMAGE_COLUMNS, json)
+        layouts: Tasks = {(one,): {"layout": one, "light": light} for one in LAYOUTS}
+        _run_processes("images", ("layout",), layouts, _IMAGE_COLUMNS, json)
         return
     if beams:
         tasks: Tasks = {(water, sea): {"water": water, "sea": sea} for water in WATERS for sea in SEAS}
@@ -253,8 +258,8 @@ def _plain_ray_rate(renderer: PassRenderer) -> float:
     return statistics.median(rates[1:])  # the first one compiles
 
 
-def measure_image(layout: str) -> dict[str, float]:
-    """Measure one layout in this process.
+def measure_image(layout: str, light: str = "merging") -> dict[str, float]:
+    """Measure one layout in this process, with the light as of `render`.
 
     ``wall_s`` is the render time with compilation, and ``render_s`` the time of the passes after the first two.
     """
@@ -272,6 +277,7 @@ def measure_image(layout: str) -> dict[str, float]:
                 params={"layout": layout, **_RECORD},
                 passes=passes,
                 seed=1,
+                light=light,
                 progress=lambda _: marks.append(time.perf_counter()),
             )
             wall, done, error = time.perf_counter() - start, passes, _bottom_error(result)

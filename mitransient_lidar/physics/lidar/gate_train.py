@@ -260,8 +260,6 @@ class GateTrain(Checked):
         `pulse`: transmitted pulse. `response_time_ns`: time constant of the receiver's single-pole response [ns], at
         least 0.
         """
-        from scipy.signal import fftconvolve
-
         opens, closes = self.shape.span_ns
         gaussian = pulse.shape == "gaussian"
         pulse_length = 14 * pulse.fwhm_ns / FWHM_PER_SIGMA if gaussian else float(np.ptp(pulse.times_ns))
@@ -275,7 +273,7 @@ class GateTrain(Checked):
         # Mean transmission over one-step cells, with one cell of margin at each end.
         edges = opens + step * (np.arange(cells + 1) - 1.5)
         gate = np.diff(self.shape.open_time(edges)) / step
-        values = np.clip(fftconvolve(gate, kernel[::-1]), 0, 1)
+        values = np.clip(_convolved(gate, kernel[::-1]), 0, 1)
         values[0] = values[-1] = 0
         start = self.start_ns + opens - step - step * (lag + kernel.size - 1)
         return ResponseTable(start, step, values)
@@ -298,8 +296,6 @@ class GateTrain(Checked):
         A waveform moves echoes to the centres of their bins, and averages over bins, as `gate_bins` does. Echo and gate
         may lie at any time in their bins; pulse and response time [ns] are as for `response_weights`.
         """
-        from scipy.signal import fftconvolve
-
         size, (opens, closes) = _CELLS_OF_BIN, self.shape.span_ns
         cell = bin_width_ns / size
         lag, kernel = pulse.kernel(cell, response_time_ns)
@@ -308,12 +304,21 @@ class GateTrain(Checked):
             cells = size * (int((closes - opens) / bin_width_ns) + 3)
             gate = np.diff(self.shape.open_time(opens + cell * (np.arange(cells + 1) - phase - 1))) / cell
             in_bins = np.repeat(gate.reshape(-1, size).mean(axis=1), size)
-            exact, cut = (fftconvolve(each, kernel[::-1]) for each in (gate, in_bins))
+            exact, cut = (_convolved(each, kernel[::-1]) for each in (gate, in_bins))
             arrival = np.arange(exact.size) - (kernel.size - 1) - lag
             centre = np.clip(arrival // size * size + size // 2 - arrival[0], 0, exact.size - 1)
             worst = max(worst, float(np.abs(cut[centre] - exact).max()))
             largest = max(largest, float(exact.max()))
         return worst / largest
+
+
+def _convolved(values: FloatArray, kernel: FloatArray) -> FloatArray:
+    """Return the full convolution, as `scipy.signal.fftconvolve`, which takes a second to import."""
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    size = values.size + kernel.size - 1
+    length = next_fast_len(size, real=True)
+    return np.asarray(irfft(rfft(values, length) * rfft(kernel, length), length)[:size])
 
 
 def range_time_ns(slant_range: float, to_sea: float, group_index: float) -> float:

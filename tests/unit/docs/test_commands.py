@@ -103,14 +103,15 @@ def test_example_files_are_those_of_the_text() -> None:
 
 
 @pytest.mark.slow
-def test_commands_of_the_readme_run_in_order(tmp_path, monkeypatch) -> None:
+@pytest.mark.parametrize("page", ["README.md", pytest.param("docs/guide/gated_cameras.md", marks=pytest.mark.long)])
+def test_commands_run_in_order(page, tmp_path, monkeypatch) -> None:
     """With two passes and few pixels: every command finds its files, and replaces none of an earlier one."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("webbrowser.open", lambda *_: True)
-    for arguments in commands(ROOT / "README.md"):
+    for arguments in commands(ROOT / page):
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
         few = ["--passes", "2"] if arguments[0] == "render" else []
-        few += ["-D", "layout=8x8"] if arguments[:2] == ["render", "gated_mine"] else []
+        few += ["-D", "layout=8x8"] if arguments[1] == "gated_mine" else []
         # The first line installs the package, and renders what the others use.
         done = run(*arguments, *few)
         assert done.exit_code == 0, f"{arguments}: {done.output}"
