@@ -102,6 +102,13 @@ class Decision:
             time[self.rows[own]], error[self.rows[own]] = self.first.surface_ns[own], self.first.surface_stderr[own]
         return time, error
 
+    def films(self) -> FloatArray:
+        """Return the delays by water that may stand on land [ns], shape (n,), 0 without land."""
+        delay = np.zeros(len(self.probability))
+        if self.first is not None:
+            delay[self.rows] = np.where(self.land, self.first.film_ns, 0.0)
+        return delay
+
     def classes(self, width: float) -> IntArray:
         """Return the `EchoClass` of surface, targets and bottom, shape (n, echoes), for an echo width [ns]."""
         exists = self.found.bins >= 0

@@ -336,6 +336,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     table["class"] = np.insert(decision.classes(width), 1, np.where(np.isfinite(column.level), EchoClass.COLUMN, 0), 1)
     table["class_probability"] = decision.probability
     table["near_ns"], table["near_stderr"] = decision.surfaces()
+    table["film_ns"] = decision.films()
     table["peak_ns"] = np.where(surface >= 0, reference, np.nan)
     table["clipped_ns"] = time[np.stack(longest_run(saturated), axis=1)]
     per_metre = 0.5 / waveforms.geometry.metres_per_ns
@@ -429,7 +430,9 @@ def _with_depths(
     by_water = errors.of_echoes(time, table["depth_m"], table["attenuation"], level, from_mean=from_mean)
     # The surface is where depths count from, or an echo of its own.
     by_water[..., 0] = 0
-    by_water = np.where(in_air, per_ns * errors.of_land()[:, np.newaxis, np.newaxis], by_water)
+    film = table.pop("film_ns")[:, np.newaxis, np.newaxis]
+    of_land = np.hypot(per_ns * errors.of_land()[:, np.newaxis, np.newaxis], per_ns * film - lines.depth_of_delay(film))
+    by_water = np.where(in_air, of_land, by_water)
     of_surface = (table["flags"] & int(EchoFlag.COLUMN_ONSET) > 0) | ((np.arange(time.shape[-1]) > 0) != from_mean)
     method = np.hypot(by_water, lines.depth_of_delay(by_light)[..., np.newaxis] * of_surface)
     table["depth_m_method_error"] = np.where(np.isfinite(table["depth_m"]), method, np.nan)

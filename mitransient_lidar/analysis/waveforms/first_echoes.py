@@ -59,6 +59,8 @@ class FirstEchoes:
         Land or bottom, and the surface before a bottom where it has an echo of its own that is told apart.
     surface_ns, surface_stderr
         Arrival of the surface of a bottom and its standard deviation [ns], shape (n,); NaN for land.
+    film_ns
+        Delay by water that may stand on land, root mean square over both possibilities [ns], shape (n,).
     """
 
     chance: FloatArray
@@ -66,13 +68,15 @@ class FirstEchoes:
     surface: Echoes
     surface_ns: FloatArray
     surface_stderr: FloatArray
+    film_ns: FloatArray
 
     def part(self, rows: BoolArray) -> FirstEchoes:
         """Return those of some of the records."""
         bottom, surface = (
             Echoes(**{name: value[rows] for name, value in vars(one).items()}) for one in (self.bottom, self.surface)
         )
-        return FirstEchoes(self.chance[:, rows], bottom, surface, self.surface_ns[rows], self.surface_stderr[rows])
+        times = (one[rows] for one in (self.surface_ns, self.surface_stderr, self.film_ns))
+        return FirstEchoes(self.chance[:, rows], bottom, surface, *times)
 
 
 @dataclass(frozen=True)
@@ -177,7 +181,7 @@ def first_echoes(
         log_sea = np.log(1 - _OF_LAND) - 0.5 * land.cost + _log_normal(land_ns, level.time_ns, spread)
         chance = np.exp([log_land, log_sea] - np.logaddexp(log_land, log_sea))
         none = np.full(count, np.nan)
-        return FirstEchoes(np.stack([*chance, zero]), own, own.known_only(zero > 0), none, none)
+        return FirstEchoes(np.stack([*chance, zero]), own, own.known_only(zero > 0), none, none, zero)
 
     sea = fits.surface()
     log_sea = np.log((1 - _OF_LAND) * _WITHOUT_BOTTOM) - 0.5 * sea.cost
@@ -224,7 +228,9 @@ def first_echoes(
     own_error = np.sqrt(np.maximum(_error(free, 0) ** 2 + error**2 - 2 * free.covariance[:, 0, 7], 0))
     surface = _echo(free, area, shape, 1, own_ns - delay, own_error).known_only(distinct)
     surface_ns, surface_stderr = np.where(distinct, (own_ns - delay, own_error), (top, top_error))
-    return FirstEchoes(chance, bottom, surface, *(np.where(dry, np.nan, one) for one in (surface_ns, surface_stderr)))
+    film = np.sqrt(chance[2] / (chance[0] + chance[2]) * np.sum(weight * delays**2, axis=0))
+    surface_ns, surface_stderr = np.where(dry, np.nan, (surface_ns, surface_stderr))
+    return FirstEchoes(chance, bottom, surface, surface_ns, surface_stderr, film)
 
 
 @dataclass(frozen=True)

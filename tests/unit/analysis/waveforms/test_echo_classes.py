@@ -103,6 +103,18 @@ def test_land_and_shallow_water_are_what_they_are():
     assert (np.abs(depth[4:] - depths) < 3 * error[4:]).all()
 
 
+def test_land_that_may_have_a_film_of_water_states_it():
+    """5 cm of clear water, 0.1 m above its mean level, look like land 1.7 cm below them; land at 0.5 m is dry."""
+    depths = np.array([-0.05, -0.5])
+    powers = [water(0.05, level=0.1, reflectance=0.05, backscattering=1e-4), land(0.5)]
+    table = echo_table.extract(recorded(powers, 4)).isel(pixel=0).sel(echo="bottom")
+    assert (table["class"] == EchoClass.LAND).all(), table["class_probability"].values
+    error = table["depth_m"].values - depths
+    stated = np.hypot(table["depth_m_stderr"], table["depth_m_method_error"]).values
+    assert (np.abs(error) < 1.2 * stated).all(), (error, stated)
+    assert np.sqrt(stated[0] ** 2 - stated[1] ** 2) > 0.7 * error[0] > 0.01
+
+
 def test_turbid_water_without_a_visible_bottom_has_none():
     """Its column, which decays within a few echo widths, was a bottom 1 m deep with a probability of 1."""
     kinds = [(k, b, glint) for k, b in ((0.4, 0.02), (0.7, 0.04), (1.2, 0.06)) for glint in (0.0, 0.02, 0.2)]
