@@ -61,11 +61,6 @@ class Expression:
     Raises UserError if it contains anything else.
 
     `name`: name of the quantity that it defines, for messages.
-
-    Attributes
-    ----------
-    names
-        Names of the quantities that it needs.
     """
 
     def __init__(self, name: str, text: str) -> None:
@@ -79,6 +74,7 @@ class Expression:
         functions = {id(node.func) for node in ast.walk(self._tree) if isinstance(node, ast.Call)}
         for node in ast.walk(self._tree):
             self._check(node, functions)
+        #: Names of the quantities that it needs.
         self.names = {
             node.id for node in ast.walk(self._tree) if isinstance(node, ast.Name) and id(node) not in functions
         }

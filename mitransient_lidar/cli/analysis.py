@@ -14,6 +14,7 @@ from mitransient_lidar.cli.messages import exit_if_interrupted, name_subject, re
 from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.interruption import DeferredInterrupt
+from mitransient_lidar.core.options import Option
 from mitransient_lidar.core.tables.written import write_csv
 
 if TYPE_CHECKING:
@@ -34,24 +35,16 @@ _REFUSED = 1  # exit code of a fit that is refused
 def _gates(
     call: Call,
     stack: Annotated[
-        Path, typer.Argument(metavar="STACK", help="An EXR or NetCDF result, a gate stack or frames of a camera.")
+        Path, Option("An EXR or NetCDF result, a gate stack or frames of a camera", form="STACK", is_argument=True)
     ],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Folder for the files, by default the folder of STACK.")
-    ] = None,
-    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw all gates, and the depths seen in them.")] = True,
-    sequence: Annotated[
-        bool, typer.Option("--sequence", help="Also write numbered EXR files, one for each gate.")
-    ] = False,
-    tiff: Annotated[
-        bool, typer.Option("--tiff", help="Also write a 16-bit TIFF file, one page per frame and gate.")
-    ] = False,
-    images: Annotated[
-        bool, typer.Option("--images", help="Also write numbered 16-bit PNG files, one per frame and gate.")
-    ] = False,
-    gif: Annotated[bool, typer.Option("--gif", help="Also write an animation.")] = False,
-    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie, by ffmpeg.")] = False,
-    html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
+    output: Annotated[Path | None, Option("Folder for the files, by default the folder of STACK")] = None,
+    plot: Annotated[bool, Option("Draw all gates, and the depths seen in them")] = True,
+    sequence: Annotated[bool, Option("Also write numbered EXR files, one for each gate")] = False,
+    tiff: Annotated[bool, Option("Also write a 16-bit TIFF file, one page per frame and gate")] = False,
+    images: Annotated[bool, Option("Also write numbered 16-bit PNG files, one per frame and gate")] = False,
+    gif: Annotated[bool, Option("Also write an animation")] = False,
+    mp4: Annotated[bool, Option("Also write a movie, by ffmpeg")] = False,
+    html: Annotated[bool, Option("Also write a page that shows the gates in a browser")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Cut gates from a result.
@@ -97,10 +90,8 @@ def _gates(
 @COMMANDS.add("Analyse results", "analysis.receiver:detect_waveforms", "output/table1.nc --receiver apd --gain auto")
 def _record(
     call: Call,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: a shot, a series, or gates.")],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="NetCDF file to write, by default FILE_recorded.nc.")
-    ] = None,
+    file: Annotated[Path, Option("An EXR or NetCDF result: a shot, a series, or gates", form="FILE", is_argument=True)],
+    output: Annotated[Path | None, Option("NetCDF file to write, by default FILE_recorded.nc")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Record the waveforms of a result with a receiver, or its gates with a camera.
@@ -134,28 +125,27 @@ def _echoes(
     call: Call,
     file: Annotated[
         Path,
-        typer.Argument(
-            metavar="FILE",
-            help="EXR or NetCDF file of a result, or NetCDF file of recorded shots; or waveforms in LAS, LAZ or "
-            "PulseWaves (.pls).",
+        Option(
+            "EXR or NetCDF file of a result, or NetCDF file of recorded shots; or waveforms in LAS, LAZ or "
+            "PulseWaves (.pls)",
+            form="FILE",
+            is_argument=True,
         ),
     ],
-    table: Annotated[bool, typer.Option("--table/--no-table", help="Print the echoes.")] = True,
-    output: Annotated[Path | None, typer.Option("--csv", metavar="OUT", help="CSV file to write.")] = None,
-    mean_surface: Annotated[
-        bool, typer.Option("--mean-surface", help="Depths from the mean surface, not from each pixel's surface echo.")
-    ] = False,
+    table: Annotated[bool, Option("Print the echoes")] = True,
+    output: Annotated[Path | None, Option("CSV file to write", form="OUT", flag="--csv")] = None,
+    mean_surface: Annotated[bool, Option("Depths from the mean surface, not from each pixel's surface echo")] = False,
     correct: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE",
-            help="Subtract the mean errors in a depth-bias table from the depths; auto for the shipped table of the "
-            "result's instrument.",
+        Option(
+            "Subtract the mean errors in a depth-bias table from the depths; auto for the shipped table of the "
+            "result's instrument",
+            form="FILE",
         ),
     ] = None,
     wind_speed: Annotated[
         float | None,
-        typer.Option(help="Wind speed for the corrections [m/s] (at least 0), by default the scene's."),
+        Option("Wind speed for the corrections [m/s] (at least 0), by default the scene's"),
     ] = None,
     waveforms: Waveforms = None,
     channel: Channel = None,
@@ -211,12 +201,10 @@ def _echoes(
 def _retrieve(
     call: Call,
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: one shot or a series of shots.")
+        Path, Option("An EXR or NetCDF result: one shot or a series of shots", form="FILE", is_argument=True)
     ],
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="NetCDF file for all estimates.")] = None,
-    figure: Annotated[
-        Path | None, typer.Option(help="PNG, PDF or SVG file for a series: estimates against the truth.")
-    ] = None,
+    output: Annotated[Path | None, Option("NetCDF file for all estimates")] = None,
+    figure: Annotated[Path | None, Option("PNG, PDF or SVG file for a series: estimates against the truth")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Retrieve slopes, bottom and water from a result.
@@ -250,13 +238,14 @@ def _fit(
     call: Call,
     file: Annotated[
         Path,
-        typer.Argument(
-            metavar="FILE",
-            help="Result or recorded signal (.nc, .exr); a CSV file with the column time_ns and one for each pixel; or "
-            "waveforms in LAS, LAZ or PulseWaves (.pls), whose mean is fitted.",
+        Option(
+            "Result or recorded signal (.nc, .exr); a CSV file with the column time_ns and one for each pixel; or "
+            "waveforms in LAS, LAZ or PulseWaves (.pls), whose mean is fitted",
+            form="FILE",
+            is_argument=True,
         ),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
+    output: Annotated[Path, Option("Folder of the files", form="DIR")] = OUTPUT,
     waveforms: Waveforms = None,
     channel: Channel = None,
     lidar: Lidar = None,

@@ -14,6 +14,7 @@ from mitransient_lidar.cli.messages import exit_if_failed, exit_if_interrupted
 from mitransient_lidar.cli.overwriting import replace_freely
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.marks import read_mark
+from mitransient_lidar.core.options import Option
 
 COMMANDS = Commands()
 
@@ -23,18 +24,10 @@ def _campaign(
     call: Call,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            help="Zarr store, by default beside the campaign; a NetCDF file with --row, a figure with --show.",
-        ),
+        Option("Zarr store, by default beside the campaign; a NetCDF file with --row, a figure with --show"),
     ] = None,
-    row: Annotated[
-        int | None, typer.Option(help="Render only the run with this number, from 0, to a NetCDF file.")
-    ] = None,
-    show: Annotated[
-        bool, typer.Option("--show", help="Draw a sample of the store, its distributions and responses.")
-    ] = False,
+    row: Annotated[int | None, Option("Render only the run with this number, from 0, to a NetCDF file")] = None,
+    show: Annotated[bool, Option("Draw a sample of the store, its distributions and responses")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Render a campaign of many runs.
@@ -96,7 +89,7 @@ def _fly(
     call: Call,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder for the files, by default output/FLIGHT."),
+        Option("Folder for the files, by default output/FLIGHT", form="DIR"),
     ] = None,
     quiet: Quiet = False,
 ) -> None:

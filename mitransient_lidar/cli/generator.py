@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, get_args, get_origin
 
 import typer
 from typer.core import TyperCommand
@@ -24,29 +24,27 @@ from mitransient_lidar.core.validation import finite, number_list
 Define = Annotated[
     list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter. Repeatable.")
 ]
-DrawingOnly = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")]
+DrawingOnly = Annotated[Path | None, Option("PNG, PDF or SVG file to write")]
 #: Default folder for rendered files.
 OUTPUT = Path("output")
 #: Options of commands that read full-waveform files of lidars (`waveform_selection`).
 Waveforms = Annotated[
     str | None,
-    typer.Option(
-        metavar="FIRST:END",
-        help="Waveforms of a LAS or LAZ file, pulses of a PulseWaves file: from number FIRST, from 0, to before END.",
+    Option(
+        "Waveforms of a LAS or LAZ file, pulses of a PulseWaves file: from number FIRST, from 0, to before END",
+        form="FIRST:END",
     ),
 ]
 Channel = Annotated[
     str | None,
-    typer.Option(
-        metavar="[FIELD=]N", help="Channel of such a file: a scanner channel, or the value of a FIELD of its points."
-    ),
+    Option("Channel of such a file: a scanner channel, or the value of a FIELD of its points", form="[FIELD=]N"),
 ]
 Lidar = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="NAME=VALUE",
-        help="What such a file does not state: pulse_fwhm_ns, altitude above the sea [m], sea_level in the file's "
-        "heights [m], refractive_index, ... Repeatable.",
+    Option(
+        "What such a file does not state: pulse_fwhm_ns, altitude above the sea [m], sea_level in the file's "
+        "heights [m], refractive_index, ... Repeatable",
+        form="NAME=VALUE",
     ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and errors.")]
@@ -210,7 +208,7 @@ class Command:
 
     def callback(self, name: str) -> Callable[..., None]:
         """Return the function that Typer calls, with a signature of all options."""
-        own = list(inspect.signature(self.body, eval_str=True).parameters.values())
+        own = list(map(_own, inspect.signature(self.body, eval_str=True).parameters.values()))
         if not self.function:
             return _decorated(name, lambda **given: self.body(**given), own)
         function = function_at(self.function)
@@ -299,7 +297,7 @@ def flag(name: str, option: Option) -> str:
 def typed(kind: Any, option: Option) -> Any:
     """Return the type that Typer reads."""
     parts = {kind, *get_args(kind)}
-    if option.form in _REPEATED:
+    if option.form in _REPEATED and not option.is_argument:
         return list[str] | None
     plain = next((one for one in _PLAIN if one in parts), str) if option.form not in _ONCE else str
     if Sequence[str] in parts and option.is_argument:
@@ -313,6 +311,7 @@ def _typer(name: str, option: Option, default: Any) -> Any:
         return typer.Argument(metavar=option.form or None, help=option.help())
     given = flag(name, option)
     return typer.Option(
+        *(["-o"] if given == "--output" else []),
         given if default is not True else f"{given}/--no-{given.removeprefix('--')}",
         metavar=option.form or None,
         help=option.help(),
@@ -328,6 +327,13 @@ def _parameter(name: str, kind: Any, option: Option, default: Any) -> inspect.Pa
     return _keyword(name, default, annotation)
 
 
+def _own(one: inspect.Parameter) -> inspect.Parameter:
+    """Return a parameter of a body as Typer reads it."""
+    if get_origin(one.annotation) is not Annotated or not isinstance(one.annotation.__metadata__[0], Option):
+        return one
+    return _parameter(one.name, one.annotation.__origin__, one.annotation.__metadata__[0], one.default)
+
+
 def _keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
@@ -338,7 +344,7 @@ def _read(option: Option, name: str, given: Any, default: Any) -> Any:
         return None if default is inspect.Parameter.empty else default
     if option.form in _ONCE:
         return _ONCE[option.form](name, given)
-    if option.form in _REPEATED:
+    if option.form in _REPEATED and not option.is_argument:
         found = [_REPEATED[option.form](name, text) for text in given]
         if "=" not in option.form:
             return found

@@ -21,23 +21,24 @@ from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, Quiet, funct
 from mitransient_lidar.cli.messages import exit_if_interrupted, summarise
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.interruption import DeferredInterrupt
+from mitransient_lidar.core.options import Option
 
 if TYPE_CHECKING:
     import xarray as xr
 
 COMMANDS = Commands()
 
-Folder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the files; created if missing.")]
+Folder = Annotated[Path, Option("Folder for the files; created if missing")]
 
 
 @COMMANDS.add("Render", "rendering.render:render", "table1 -D wind_speed=5 --target-error 0.05")
 def _render(
     call: Call,
     output: Folder = OUTPUT,
-    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms, pixels and gates.")] = True,
-    gif: Annotated[bool, typer.Option("--gif", help="Also write a gate animation.")] = False,
-    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a gate movie, by ffmpeg.")] = False,
-    html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
+    plot: Annotated[bool, Option("Draw waveforms, pixels and gates")] = True,
+    gif: Annotated[bool, Option("Also write a gate animation")] = False,
+    mp4: Annotated[bool, Option("Also write a gate movie, by ffmpeg")] = False,
+    html: Annotated[bool, Option("Also write a page that shows the gates in a browser")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Render the waveforms and gates of a scene.
@@ -114,12 +115,12 @@ def _shots(
     call: Call,
     places: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="CSV file with shot locations, columns x and y [m], instead of random ones."),
+        Option("CSV file with shot locations, columns x and y [m], instead of random ones", form="FILE"),
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file for all shots.")] = OUTPUT / "shots.nc",
+    output: Annotated[Path, Option("NetCDF file for all shots")] = OUTPUT / "shots.nc",
     figure: Annotated[
         Path | None,
-        typer.Option(help="PNG, PDF or SVG file of the echoes against the slopes; also writes these data as .nc."),
+        Option("PNG, PDF or SVG file of the echoes against the slopes; also writes these data as .nc"),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -178,7 +179,7 @@ def _shots(
 def _frames(
     call: Call,
     output: Folder = OUTPUT,
-    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the mean over the frames.")] = True,
+    plot: Annotated[bool, Option("Draw the mean over the frames")] = True,
     quiet: Quiet = False,
 ) -> None:
     """Render frames of gate images, each with its own pulses.
@@ -208,7 +209,7 @@ def _frames(
 def _passive(
     call: Call,
     output: Folder = OUTPUT,
-    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the image, or animate the frames.")] = True,
+    plot: Annotated[bool, Option("Draw the image, or animate the frames")] = True,
     quiet: Quiet = False,
 ) -> None:
     """Render an image by daylight.

@@ -22,6 +22,7 @@ from mitransient_lidar.cli.generator import (
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.cli.overwriting import draws_again, parameters
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -35,33 +36,24 @@ _DIFFERENT = 1
 def _view(
     file: Annotated[
         Path,
-        typer.Argument(
-            metavar="FILE",
-            help="EXR or NetCDF file of a result, a gate stack or recorded signals; XML file or name of a scene; LAS "
-            "file, folder or store of a flight; waveforms in PulseWaves (.pls) or, with --waveforms, LAS or LAZ.",
+        Option(
+            "EXR or NetCDF file of a result, a gate stack or recorded signals; XML file or name of a scene; LAS "
+            "file, folder or store of a flight; waveforms in PulseWaves (.pls) or, with --waveforms, LAS or LAZ",
+            form="FILE",
+            is_argument=True,
         ),
     ],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            help="HTML file for the page, by default a temporary one; PNG, PDF or SVG file for a drawing.",
-        ),
+        Option("HTML file for the page, by default a temporary one; PNG, PDF or SVG file for a drawing"),
     ] = None,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
-    shot: Annotated[
-        int | None, typer.Option(help="Number of a shot in a series, from 0; by default their mean.")
-    ] = None,
-    plot: Annotated[bool, typer.Option("--plot", help="Draw the waveforms instead, to FILE.png.")] = False,
-    log: Annotated[bool, typer.Option("--log", help="Draw them with a logarithmic power axis only.")] = False,
-    linear: Annotated[bool, typer.Option("--linear", help="Draw them with a linear power axis only.")] = False,
-    components: Annotated[
-        bool, typer.Option("--components", help="Draw the light by origin instead, to FILE_components.png.")
-    ] = False,
-    layout: Annotated[
-        bool, typer.Option("--layout", help="Draw pixels, beam and targets on the sea instead, to FILE_layout.png.")
-    ] = False,
+    browser: Annotated[bool, Option("Open the page in the browser")] = True,
+    shot: Annotated[int | None, Option("Number of a shot in a series, from 0; by default their mean")] = None,
+    plot: Annotated[bool, Option("Draw the waveforms instead, to FILE.png")] = False,
+    log: Annotated[bool, Option("Draw them with a logarithmic power axis only")] = False,
+    linear: Annotated[bool, Option("Draw them with a linear power axis only")] = False,
+    components: Annotated[bool, Option("Draw the light by origin instead, to FILE_components.png")] = False,
+    layout: Annotated[bool, Option("Draw pixels, beam and targets on the sea instead, to FILE_layout.png")] = False,
     waveforms: Waveforms = None,
     channel: Channel = None,
     lidar: Lidar = None,
@@ -178,9 +170,9 @@ def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
 @COMMANDS.add("Analyse results", "", "one/table1.nc other/table1.nc")
 def _compare(
     first: Annotated[
-        Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result, or the record of shots, also LAS or .pls.")
+        Path, Option("An EXR or NetCDF result, or the record of shots, also LAS or .pls", form="FILE", is_argument=True)
     ],
-    second: Annotated[Path, typer.Argument(metavar="OTHER", help="A result with the same pixels and bins or gates.")],
+    second: Annotated[Path, Option("A result with the same pixels and bins or gates", form="OTHER", is_argument=True)],
     output: DrawingOnly = None,
     waveforms: Waveforms = None,
     channel: Channel = None,

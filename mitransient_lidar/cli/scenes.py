@@ -12,6 +12,7 @@ from mitransient_lidar.cli.files import check_targets, write_page
 from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, Quiet
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import Option
 from mitransient_lidar.core.tables.written import aligned_lines
 
 COMMANDS = Commands()
@@ -35,8 +36,8 @@ def list_scenes() -> None:
 
 @SCENES.add("Commands")
 def _show(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")],
-    html: Annotated[bool, typer.Option("--html", help="Write NAME.html, a page of the scene, instead.")] = False,
+    name: Annotated[str, Option("Name of a shipped scene", form="NAME", is_argument=True)],
+    html: Annotated[bool, Option("Write NAME.html, a page of the scene, instead")] = False,
 ) -> None:
     """Print the XML of a scene, self-contained, or write a page that shows it, as view NAME does."""
     if html:
@@ -54,10 +55,10 @@ def _show(
 @SCENES.add("Commands")
 def _copy(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Shipped scene, or file of a guide or flight, e.g. bottoms.toml.")
+        str, Option("Shipped scene, or file of a guide or flight, e.g. bottoms.toml", form="NAME", is_argument=True)
     ],
-    destination: Annotated[Path, typer.Argument(metavar="DEST", help="Folder, or path of the new file.")] = Path("."),
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+    destination: Annotated[Path, Option("Folder, or path of the new file", form="DEST", is_argument=True)] = Path("."),
+    overwrite: Annotated[bool, Option("Replace files that exist")] = False,
 ) -> None:
     """Copy a scene or an example file to edit."""
     from mitransient_lidar.loading import catalogue
@@ -67,10 +68,8 @@ def _copy(
 
 @SCENES.add("Commands")
 def _instruments(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Name of an instrument.")] = None,
-    xml: Annotated[
-        bool, typer.Option("--xml", help="Print the XML of laser and receiver, to include in a scene.")
-    ] = False,
+    name: Annotated[str | None, Option("Name of an instrument", form="NAME", is_argument=True)] = None,
+    xml: Annotated[bool, Option("Print the XML of laser and receiver, to include in a scene")] = False,
 ) -> None:
     """List the instruments, or print the parameters of one with their sources.
 
@@ -97,7 +96,7 @@ def _instruments(
 @COMMANDS.add(_HEADING, "plots.publication.figures:figures", "fig09 fig13")
 def _figures(
     call: Call,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for figures and table.")] = OUTPUT / "figures",
+    output: Annotated[Path, Option("Folder for figures and table")] = OUTPUT / "figures",
     quiet: Quiet = False,
 ) -> None:
     """Make the figures of the published model again.
@@ -122,7 +121,7 @@ def _figures(
 
 @COMMANDS.add(_HEADING, "", "output/table1.nc")
 def _info(
-    file: Annotated[Path | None, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")] = None,
+    file: Annotated[Path | None, Option("An EXR or NetCDF result", form="FILE", is_argument=True)] = None,
 ) -> None:
     """Print versions, the Mitsuba variant and LLVM's path, or a result's parameters.
 

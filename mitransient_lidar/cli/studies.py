@@ -11,10 +11,11 @@ import typer
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
 from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, DrawingOnly, Quiet, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted
+from mitransient_lidar.core.options import Option
 
 COMMANDS = Commands()
 
-Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; also writes the data as .nc.")]
+Figure = Annotated[Path, Option("PNG, PDF or SVG file; also writes the data as .nc")]
 
 #: Headings of the help.
 _DESIGN, _LIGHT, _SURVEY = "Targets and designs", "Light in water", "Depths and their uncertainty"
@@ -178,12 +179,8 @@ def _water(call: Call, output: DrawingOnly = None) -> None:
 @COMMANDS.add(_SURVEY, "studies.depth_bias:depth_bias", "riegl_vq840g --winds 0,3 --depths 3,6")
 def _depth_bias(
     call: Call,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="NetCDF file, by default output/INSTRUMENT_depths.nc.")
-    ] = None,
-    figure: Annotated[
-        Path | None, typer.Option(help="PNG, PDF or SVG file: biases of all estimators against the angle.")
-    ] = None,
+    output: Annotated[Path | None, Option("NetCDF file, by default output/INSTRUMENT_depths.nc")] = None,
+    figure: Annotated[Path | None, Option("PNG, PDF or SVG file: biases of all estimators against the angle")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Measure the depth errors in an instrument's records.
@@ -209,7 +206,7 @@ def _depth_bias(
 @COMMANDS.add(_SURVEY, "studies.depth_bias:tpu", "riegl_vq840g --altitudes 100,150")
 def _tpu(
     call: Call,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the files.")] = OUTPUT,
+    output: Annotated[Path, Option("Folder for the files", form="DIR")] = OUTPUT,
     quiet: Quiet = False,
 ) -> None:
     """Determine the vertical and horizontal uncertainty of an instrument's soundings.

@@ -173,18 +173,10 @@ class Echoes:
 
 
 class Probe:
-    """Look ahead of a lidar, made once for a scene.
-
-    Attributes
-    ----------
-    scene
-        The scene; with several shots the first one's.
-    sampler
-        Sampler for the rays of its view.
-    """
+    """Look ahead of a lidar, made once for a scene: with several shots the first one's."""
 
     def __init__(self, scene: LidarScene) -> None:
-        self.scene, self.sampler = scene, SensorSampler(scene.receiver, scene.transmitter)
+        self.scene, self.sampler = scene, SensorSampler(scene.receiver, scene.transmitter)  #: Sampler of its view.
 
     @cached_property
     def view(self) -> Rays:

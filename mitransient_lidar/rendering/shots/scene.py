@@ -50,19 +50,6 @@ class ShotScene:
         Whether to tell the time bins, and to check the scene.
     light
         As of `series.render_shots`.
-
-    Attributes
-    ----------
-    session
-        The loaded scene.
-    lidar
-        Lidar of the first shot, with time bins for all shots.
-    parameters
-        Parameters by which light is differentiated.
-    window
-        Bins whose errors count, in each pixel.
-    light
-        Computation of the light, ``merging`` or ``maps``.
     """
 
     def __init__(
@@ -95,13 +82,13 @@ class ShotScene:
             self.session.tell_axis(axis, own.record_end)
         renderer = self._prepare(axis, light)
         renderer = renderer.by_origin() if components else renderer
-        self.parameters = path_parameters(renderer, derivatives)
+        self.parameters = path_parameters(renderer, derivatives)  #: By which light is differentiated.
         self._renderer = renderer.perturbed(perturbations(self.parameters)) if self.parameters else renderer
-        self.lidar: LidarScene = self._renderer.scene
+        self.lidar: LidarScene = self._renderer.scene  #: Lidar of the first shot, with time bins for all shots.
         self.companions = self._find_companions()
         bins = self.lidar.receiver.pixels.count, self.lidar.axis.bin_count
         check_size(len(places), *bins, renderer.classes.count if components else 0, len(self.parameters))
-        self.window = ErrorWindow.of_probe(renderer.probe)
+        self.window = ErrorWindow.of_probe(renderer.probe)  #: Bins whose errors count, in each pixel.
         if check:
             check_scene(renderer.probe)
         self._described = describe_scene(renderer.probe, self.window, self._renderer.focusing)

@@ -130,20 +130,13 @@ class PathClasses:
 
 
 class ReceivedLight:
-    """Light received in one pass: a histogram by pixel, or by pixel class, and time.
-
-    Attributes
-    ----------
-    rays
-        Number of traced rays.
-    gated
-        Light in gates that is received beside the histogram, or None.
-    """
+    """Light received in one pass: a histogram by pixel, or by pixel class, and time."""
 
     def __init__(
         self, histograms: Sequence[TransientHistogram], classes: PathClasses, focusing: RippleFocusing | None = None
     ) -> None:
         self._all, self.classes, self.focusing = histograms, classes, focusing
+        #: The histogram, and that of gates beside it, or None.
         self.histogram, self.gated = histograms[0], histograms[1] if len(histograms) > 1 else None
         self.clear()
 
@@ -151,7 +144,7 @@ class ReceivedLight:
         """Remove all light."""
         for each in self._all:
             each.clear()
-        self.rays = mi.Float64(0)
+        self.rays = mi.Float64(0)  #: Number of traced rays.
 
     def receive(
         self,
