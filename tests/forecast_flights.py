@@ -101,7 +101,7 @@ def main() -> None:
         instrument, _, water, wind, (low, high), height, *_ = case
         params = {"jerlov": water, "wind_speed": wind, "bottom_reflectance": 0.15, "altitude": height}
         begun = time.process_time()
-        forecast = mitransient_lidar.forecast(instrument, f"{low - 1}:{high + 1}", {**params, "off_nadir_deg": 20.0})
+        forecast = mitransient_lidar.forecast(instrument, f"{low}:{high}", {**params, "off_nadir_deg": 20.0})
         seconds = time.process_time() - begun
         for gain in (float(np.max(forecast.attrs["gain"])), None):
             with tempfile.TemporaryDirectory() as folder:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from mitransient_lidar.analysis.receiver import SATURATING
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoClass
 from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
@@ -136,7 +137,11 @@ class FlightRenderer(Renderer):
         for setting, text in SETTINGS.items():
             if name.startswith(setting):
                 number = name.removeprefix(setting)
-                return {"units": "1", "long_name": f"{text} of channel {number} of the receiver, chosen for the flight"}
+                return {
+                    "units": "1",
+                    "long_name": f"{text} of channel {number} of the receiver, chosen for the flight",
+                    "saturating_share": SATURATING,
+                }
         return described(name, "flight")
 
     def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:

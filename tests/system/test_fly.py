@@ -121,6 +121,20 @@ def test_points_of_a_flight_lie_where_surface_and_bottom_are(tmp_path, seed, tur
 
 
 @pytest.mark.slow
+def test_the_automatic_gain_does_not_depend_on_the_length_of_a_flight():
+    """Over waves, of which a longer flight meets brighter glints: 300 and 600 pulses that look other ways."""
+    chosen = []
+    for count, heading in ((300, 90.0), (600, 30.0)):
+        platform = {**FLIGHT["platform"], "heading_deg": heading, "duration_s": count / 1000, "noise": {}}
+        given = {"platform": platform, "parameters": {}, "pulses": {"rate_hz": 1000.0, "most": count}, "light": "maps"}
+        _, columns = FlightRenderer.of(FlightPlan.of_file({**FLIGHT, **given}))
+        assert np.ptp(columns["receiver_gain_0"]) == 0
+        chosen.append(columns["receiver_gain_0"][0])
+    assert 0 < chosen[0] < 0.5
+    assert chosen[1] == pytest.approx(chosen[0], rel=0.03)
+
+
+@pytest.mark.slow
 def test_turned_pixels_look_where_others_did():
     """By 90 degrees each pixel takes the place of the next one, and by 45 one looks along the plane of incidence."""
     session = open_scene("flight", {"off_nadir_deg": 30.0, "layout": "2x2"})

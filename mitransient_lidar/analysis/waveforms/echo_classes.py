@@ -23,7 +23,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
 )
 from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape
 from mitransient_lidar.analysis.waveforms.first_echoes import SEPARATE, FirstEchoes, Priors, first_echoes
-from mitransient_lidar.analysis.waveforms.records import Waveforms
+from mitransient_lidar.analysis.waveforms.records import Rows, Waveforms
 from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, SurfaceLevel
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
@@ -125,7 +125,7 @@ class Decision:
 
 def decide(
     waveforms: Waveforms,
-    part: slice,
+    part: Rows,
     records: Records,
     level: SurfaceLevel,
     decay: float,

@@ -28,7 +28,7 @@ from mitransient_lidar.analysis.waveforms.surface_times import (
 )
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
-from mitransient_lidar.core.validation import integer
+from mitransient_lidar.core.validation import IntArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
 from mitransient_lidar.results.attributes import flagged, label, made_from, split
@@ -217,17 +217,15 @@ def extract(
         level = infrared_level(extract(infrared), infrared, dataset, waveforms.lines, waveforms.count)
     wanted = None if targets is None else integer("targets", targets, 1, 100)
     settings = _Settings(names, threshold, contrast, layers, depth_from, level, iterations, wanted)
-    table = _measured(waveforms, block, settings)
-    unsure = table["class_probability"] < 1
-    better = _level_of_neighbours(waveforms, table, settings) if settings.level is None and unsure.any() else None
+    table = _measured(waveforms, np.arange(waveforms.count), block, settings)
+    unsure = np.flatnonzero(table["class_probability"] < 1)
+    better = _level_of_neighbours(waveforms, table, settings) if settings.level is None and unsure.size else None
     if better is not None:
-        again = _measured(waveforms, block, replace(settings, level=better))
+        again = _measured(waveforms, unsure, block, replace(settings, level=better))
         count = max(one["flags"].shape[-1] for one in (table, again)) - len(ECHOES) + 1
-        first, second = (_with_targets(one, count) for one in (table, again))
-        table = {
-            name: np.where(unsure.reshape(-1, *[1] * (values.ndim - 1)), second[name], values)
-            for name, values in first.items()
-        }
+        table, again = (_with_targets(one, count) for one in (table, again))
+        for name, values in again.items():
+            table[name][unsure] = values
     table = _with_depths(dataset, waveforms, table, settings)
     return _label(dataset, waveforms, table, settings, several)
 
@@ -259,10 +257,9 @@ def _with_targets(part: dict[str, npt.NDArray[Any]], targets: int) -> dict[str, 
     return filled
 
 
-def _measured(waveforms: Waveforms, block: int, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
-    """Return the quantities of all waveforms, of which a block is in memory at a time."""
-    starts = range(0, waveforms.count, block)
-    parts = [_measure(waveforms, slice(start, min(start + block, waveforms.count)), settings) for start in starts]
+def _measured(waveforms: Waveforms, rows: IntArray, block: int, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
+    """Return the quantities of some waveforms, of which a block is in memory at a time."""
+    parts = [_measure(waveforms, rows[start : start + block], settings) for start in range(0, rows.size, block)]
     count = settings.targets or max(part["flags"].shape[-1] for part in parts) - len(ECHOES) + 1
     parts = [_with_targets(part, count) for part in parts]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -287,7 +284,7 @@ def _level_of_neighbours(
     return waveforms.surface_level(rows).of_neighbours(time, error, certain, 1 / (IN_AIR * np.cos(lines.off_nadir)))
 
 
-def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
+def _measure(waveforms: Waveforms, rows: IntArray, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
     """Return the quantities of some of the waveforms by name, shape (waveforms, ...)."""
     records, width, level = waveforms.records(rows), waveforms.echo_fwhm_ns, waveforms.surface_level(rows)
     decision = decide(

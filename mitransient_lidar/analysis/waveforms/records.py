@@ -20,12 +20,15 @@ from mitransient_lidar.analysis.waveforms.saturation import level_error
 from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, LEVEL, SurfaceLevel
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, positive
+from mitransient_lidar.core.validation import FloatArray, IntArray, positive
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry, surface_time_ns
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.electronics import LogAmplifier
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, pulse_of, required_number
 from mitransient_lidar.results.sum_errors import BlockCorrelation, SumErrors
+
+#: Some of the waveforms.
+Rows = IntArray | slice
 
 _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
 _FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
@@ -237,11 +240,15 @@ class Waveforms:
         """Largest share of the beam in a pixel, 0 where it is not known."""
         return float(np.nan_to_num(self.lines.beam_share).max(initial=0.0))
 
-    def lines_of(self, rows: slice) -> LinesOfSight:
-        """Return the lines of sight of some of the waveforms."""
-        return self.lines.at(np.arange(rows.start, rows.stop) % self.lines.off_nadir.size)
+    def _numbers(self, rows: Rows) -> IntArray:
+        """Return the numbers of some waveforms."""
+        return np.arange(self.count)[rows]
 
-    def latest_surface(self, rows: slice) -> FloatArray:
+    def lines_of(self, rows: Rows) -> LinesOfSight:
+        """Return the lines of sight of some of the waveforms."""
+        return self.lines.at(self._numbers(rows) % self.lines.off_nadir.size)
+
+    def latest_surface(self, rows: Rows) -> FloatArray:
         """Return the latest times of the surface echo [ns], of the lowest point of the sea, shape (waveforms,).
 
         Pixels without direct light have none.
@@ -252,24 +259,24 @@ class Waveforms:
         dark = lines.beam_share < LEAST_SHARE * self.brightest
         return np.asarray(lines.surface_time + np.where(dark, 0, trough + margin))
 
-    def surface_level(self, rows: slice) -> SurfaceLevel:
+    def surface_level(self, rows: Rows) -> SurfaceLevel:
         """Return the arrival of the mean sea level in some of the waveforms, with the waves about it."""
         lines = self.lines_of(rows)
         per_metre = 1 / (0.5e-9 * C0 * np.cos(lines.off_nadir))
         waves = (self.highest_m - self.lowest_m) / HEIGHTS
         return SurfaceLevel(lines.surface_time, np.hypot(math.hypot(waves, LEVEL) * per_metre, lines.surface_spread))
 
-    def column_signal(self, rows: slice) -> FloatArray:
+    def column_signal(self, rows: Rows) -> FloatArray:
         """Return the signal of a column at the surface per backscattering coefficient, 0 where it is not known."""
         share = np.nan_to_num(self.lines_of(rows).beam_share)
-        pixel = np.arange(rows.start, rows.stop) % self.sensitivity.size
+        pixel = self._numbers(rows) % self.sensitivity.size
         return np.asarray(share * self.sensitivity[pixel] * np.nan_to_num(self.column_gain))
 
-    def events(self, rows: slice) -> FloatArray:
+    def events(self, rows: Rows) -> FloatArray:
         """Return the heights that single events of the detector reach, shape (waveforms,)."""
-        return np.asarray(self.event_height[np.arange(rows.start, rows.stop) % self.event_height.size])
+        return np.asarray(self.event_height[self._numbers(rows) % self.event_height.size])
 
-    def gain(self, rows: slice) -> FloatArray:
+    def gain(self, rows: Rows) -> FloatArray:
         """Return the signal over that at the surface by distance, refraction and waves, shape (waveforms, time)."""
         lines = self.lines_of(rows)
         spreading = lines.spreading(self.geometry, self.time_ns)
@@ -277,15 +284,15 @@ class Waveforms:
             return spreading
         return spreading * self.focusing.at(lines.depth_of_time(np.broadcast_to(self.time_ns, spreading.shape)))
 
-    def saturated_samples(self, rows: slice, records: Records) -> npt.NDArray[np.bool_]:
+    def saturated_samples(self, rows: Rows, records: Records) -> npt.NDArray[np.bool_]:
         """Return which samples of some of the waveforms are saturated, shape (waveforms, time)."""
-        baseline = self.baseline[np.arange(rows.start, rows.stop) % self.baseline.size, np.newaxis]
+        baseline = self.baseline[self._numbers(rows) % self.baseline.size, np.newaxis]
         high: npt.NDArray[np.bool_] = records.power + baseline >= self.saturation_level
         return high if self.saturated is None else high | self.saturated[rows]
 
-    def records(self, rows: slice) -> Records:
+    def records(self, rows: Rows) -> Records:
         """Return some of the waveforms less their baseline."""
-        pixel = np.arange(rows.start, rows.stop) % self.baseline.size
+        pixel = self._numbers(rows) % self.baseline.size
         noise = self.noise[rows] if len(self.noise) == self.count else self.noise[pixel]
         found = Records.of(self.samples[rows] - self.baseline[pixel, np.newaxis], self.time_ns, noise)
         return replace(found, shared=self.shared)
