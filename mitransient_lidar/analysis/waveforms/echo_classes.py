@@ -41,7 +41,8 @@ _RETURNS, _BRIGHTEST = (2.2, 3.2), 0.5
 # Standard errors of a column's energy that make the echo before it the surface's, and its length [ns].
 _COLUMN, _COLUMN_NS = 5.0, 20.0
 _SHALLOW = 2.0  # largest depth of bottoms that are told from first echoes [m]
-_CLEAR = 8.0  # least height over the noise of one of the echoes that are decided upon
+_CLEAR = 8.0  # least height over the noise of one of the echoes at the surface's level that are decided upon
+_LATE = 2.5  # standard deviations of the surface's time behind it from which fainter echoes are decided upon
 _OPEN = 2.0  # least length of a column between two echoes that tells a weak surface, in echo widths
 
 
@@ -137,9 +138,10 @@ def decide(
     An echo that is more than 4 standard deviations before the surface's level, and 1.2 echo widths before others, is an
     object above the water. First echoes without others, or with others nearer than 1.8 echo widths, are those of
     `first_echoes.first_echoes`, unless they are at the surface's level and a column follows them. A surface without a
-    column is likelier than land, or has a probability of 90 % where it is a bottom rather than land. In the near
-    infrared, where column and bottom are part of the surface's echo, a first echo is land or the surface, and nothing
-    follows the surface.
+    column is likelier than land, or has a probability of 90 % where it is a bottom rather than land. Echoes
+    below 8 standard errors are the surface's, with the probability of this, unless they are more than 2.5 standard
+    deviations behind its level. In the near infrared, where column and bottom are part of the surface's echo, a first
+    echo is land or the surface, and nothing follows the surface.
 
     Of 150 drawn records each (VQ-880-G II at nadir and 600 m, a level known to 0.15 m, glints from none to five times
     the bottom's echo, reflectances 0.05 to 0.4), all land from 0.2 to 4 m is land, and 99 % of the bottoms from 0.3 to
@@ -215,18 +217,18 @@ def decide(
     # What follows a first echo far below the level is light that met it twice, however late.
     by_following = near & ~((deviation() > _FAR) & _is_weak_behind(records, found.surface, following))
     is_shallow = records.time_of(np.where(by_following, following, found.surface)) < farthest
-    # A faint echo may be the rise of the column, and one at the record's end may have a column behind it.
+    # An echo at the record's end may have a column behind it.
     left = records.time_ns[-1] - records.time_of(found.surface)
     behind = np.minimum(following, last - 1)
     is_clear = ~_is_weak(records, found.surface, _CLEAR) | (near & ~_is_weak(records, behind, _CLEAR))
-    is_clear &= left > waveforms.tail_ns + _COLUMN_NS
+    is_whole = left > waveforms.tail_ns + _COLUMN_NS
     opaque = waveforms.fading.opaque
     if opaque:
         # Land or water; what follows a surface is in its echo.
         found, near = _surface_alone(found, above), np.zeros_like(near)
         tested = np.flatnonzero((found.surface >= 0) & np.isfinite(shallow))
     else:
-        tested = np.flatnonzero((found.surface >= 0) & (near | (following == last)) & is_shallow & is_clear)
+        tested = np.flatnonzero((found.surface >= 0) & (near | (following == last)) & is_shallow & is_whole)
         at_level = np.abs(deviation()[tested]) < _FAR
         # Beyond light that has met a near bottom twice, or at the end of a record that is cut short.
         beyond = waveforms.tail_ns + np.clip(left[tested] - waveforms.tail_ns - _COLUMN_NS, 0, _FAR_APART * width)
@@ -254,9 +256,11 @@ def decide(
     peak = pair[np.argmax(heights, axis=0), np.arange(len(tested))]
     extent = np.where(near[tested], (following[tested] - peak) * records.bin_ns + width, 0.0)
     first = first_echoes(records.part(tested), peak, pulse, shape, width, priors, extent)
-    probability[tested] = first.chance.max(axis=0)
     land, sea, bottom = first.chance
     decided = sea < np.where(bottom > land, _OVER_BOTTOM, land)
+    # A faint echo at the surface's level may be the rise of the column.
+    decided &= is_clear[tested] | (deviation()[tested] > _LATE) | opaque
+    probability[tested] = np.where(decided, np.maximum(land, bottom), sea)
     return _decided(Decision(found, above, probability, tested[decided], first.part(decided)), records, shape, width)
 
 

@@ -135,6 +135,15 @@ def test_clear_seas_below_a_step_of_the_digitiser_are_no_land():
     np.testing.assert_allclose(depth[9:], -heights, atol=0.03)
 
 
+def test_faint_bottoms_without_a_surface_are_found():
+    """First echoes below 8 standard errors were surfaces with a probability of 1, too late for the level, and lost."""
+    record = recorded([water(0.5, backscattering=1e-3, level=level) for level in (-0.1, 0.0, 0.1)], 6)
+    noise = float(record["signal_mean"].max()) / 6.5
+    (_, bottom), depth, error = found(record, noise=noise)
+    assert np.isin(bottom, [EchoClass.BOTTOM, EchoClass.MERGED]).all()
+    assert (np.abs(depth - 0.5) < 3 * error).all()
+
+
 def test_turbid_water_seen_by_long_pulses_has_no_bottom():
     """A blurred bottom below a column of a free decay fits such columns as well, with more parameters."""
     kinds = [(k, b, glint) for k, b in ((0.5, 0.03), (0.75, 0.1)) for glint in (0.0, 0.02)]
