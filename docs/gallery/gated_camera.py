@@ -45,9 +45,10 @@ plt.show()
 
 # %%
 # The probability that the best weighted sum of all pixels and gates shows the mine, with one false alarm in 1000. Few
-# passes and renders here: with more, the limits are closer.
+# paths and renders here: with more, the limits are closer.
 
-found = mitransient_lidar.detect("gated_mine", {**params, **gates}, receiver="icmos", renders=3, passes=16, seed=1)
+few = {**params, **gates, "paths_per_pass": 2**12, "photons_per_pass": 2**12}
+found = mitransient_lidar.detect("gated_mine", few, receiver="icmos", renders=3, passes=16, seed=1)
 needed = float(found.frames_needed)
 print(f"one frame of each gate: P_d = {float(found.detection.sel(frames=1)):.2f}; frames for 0.9: {needed:.0f}")
 figure, (left, right) = plt.subplots(1, 2, figsize=(7, 2.8), layout="constrained")

@@ -14,7 +14,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.gates.recording import describe_frames, parameters_of, powers_of, record_gates
+from mitransient_lidar.analysis.gates.recording import parameters_of, powers_of, record_gates
+from mitransient_lidar.analysis.recorded import is_automatic, saturation_advice
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import RECEIVERS_OR_CAMERAS, Option, Seed, checked
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, require_memory
@@ -45,20 +46,22 @@ _LOG = logging.getLogger(__name__)
 
 DENSEST = 12.0  # largest optical density
 
+#: Largest share of a series' shots that may saturate with an automatic gain or filter.
+SATURATING = 0.05
+
 _GAIN = (
-    "Factor of the amplifier's gain, or auto for the largest up to 1 without saturation; by default the receiver's, or "
-    "1"
+    "Factor of the amplifier's gain, or auto for the largest up to 1 without saturation, but of 5 % of a series' "
+    "shots; by default the receiver's, or 1"
 )
 Gain = Annotated[Setting | None, Option(_GAIN, 0, above=True, form="NUMBER|auto")]
 _DENSITY = (
     "Optical density of a filter before the detector, also for daylight, or auto for the least multiple of 0.1 without "
-    "saturation; by default the receiver's, or 0"
+    "saturation, as for gain; by default the receiver's, or 0"
 )
 OpticalDensity = Annotated[Setting | None, Option(_DENSITY, 0, DENSEST, form="NUMBER|auto")]
 
 _FAINT_W, _STEADY_BINS = 1e-9, 256  # light of which the sensitivity is measured [W], and its bins
 _BYTES_PER_SAMPLE = 16  # memory of a sample: 8 while it is drawn, and 21 when its record is written
-_LISTED_PIXELS = 12  # most pixels whose saturation is listed
 
 
 @checked
@@ -95,7 +98,7 @@ def detect_waveforms(
         Steady power in addition to the waveform [W], not negative: a number, or one per pixel; see
         `physics.lidar.clear_sky.background_power`.
     advice : bool
-        Whether to find the gain and the optical density that fit, too, where they are not 'auto'.
+        Whether to find the gain and the optical density that fit, where they are not 'auto', and to log saturation.
 
     Returns
     -------
@@ -109,7 +112,8 @@ def detect_waveforms(
         ``time_start_ns`` and ``bin_width_ns`` describe the samples; other coordinates and attributes come from the
         result. The chain's parameters are added as ``receiver.*``, with ``gain`` and ``optical_density`` as used;
         ``chosen`` names the one that was 'auto'. ``fitting_gain`` and ``fitting_optical_density`` each avoid saturation
-        while the other one is kept (`ReceiverChain.fitting_gain`). Where channels differ, chain attributes are
+        while the other one is kept (`ReceiverChain.fitting_gain`), but in ``saturating_share`` of a series' shots, at
+        most `SATURATING`. Where channels differ, chain attributes are
         ``receiver.channels.NAME.*``, and the others lists over the pixels. ``event_height`` over the pixels comes from
         `ReceiverChain.event_height`. ``receiver_response`` over ``lag`` [ns] is the weight of a bin's light in later
         samples. If a converter stores blocks, samples outside them are NaN, and ``dark_level`` and ``block_level`` over
@@ -155,8 +159,8 @@ def detect_waveforms(
     recorded.attrs |= {"noise_seed": int(seed)} | ({} if receiver.name == "custom" else {"receiver": receiver.name})
     if receiver.pulse_repetition_khz is not None:
         recorded.attrs["pulse_repetition_khz"] = receiver.pulse_repetition_khz
-    if recorded["saturated"].any():
-        _LOG.warning("%s", saturation_advice(recorded))
+    if advice and recorded["saturated"].any():
+        _LOG.log(logging.INFO if is_automatic(recorded) else logging.WARNING, "%s", saturation_advice(recorded))
     return recorded
 
 
@@ -204,9 +208,27 @@ def pixel_chains(
     found: dict[int, PixelChain] = {}
     for channel, pixels in groups:
         own = backgrounds[pixels]
-        used, density, _ = _in_range(channel, light[pixels], width, own, advice=False)
+        used, density, _ = _in_range(channel, light[pixels], width, own, advice=False, series=False)
         found |= {pixel: PixelChain(used, 10**-density, float(backgrounds[pixel])) for pixel in pixels}
     return [found[pixel] for pixel in range(len(light))]
+
+
+def shared_settings(
+    dataset: xr.Dataset, receiver: ReceiverChannels, background_power: npt.ArrayLike = 0.0
+) -> dict[int, tuple[float, float]]:
+    """Return gain and optical density of a receiver's automatic channels, by their number, for all shots of a series.
+
+    They are those with which `detect_waveforms` would record the series.
+    """
+    _, groups, sky = _channels(dataset, receiver, None, None, background_power)
+    width, (_, light) = results.time_axis(dataset).bin_width_ns, _waveform(dataset)
+    found: dict[int, tuple[float, float]] = {}
+    for channel, pixels in groups:
+        if "auto" in (channel.gain, channel.optical_density):
+            own = np.broadcast_to(sky, light.shape[1:-1])[pixels]
+            _, density, used = _in_range(channel, light[:, pixels], width, own, advice=False, series=True)
+            found[receiver.number_of(str(dataset["pixel"].values[pixels[0]]))] = float(used["gain"]), density
+    return found
 
 
 def _channels(
@@ -287,7 +309,7 @@ def _record_channel(
     smoothed = given.low_pass(width).weights.size > 1
     if smoothed and float(dataset.attrs.get("response_time_ns", 0)) > 0:
         _LOG.warning("the waveform includes a response time already, and the amplifier's bandwidth smooths it again")
-    receiver, density, fitting = _in_range(channel, light, width, sky, advice)
+    receiver, density, fitting = _in_range(channel, light, width, sky, advice, series)
     number = integer("shots", shots, 1, 10**9)
     require_memory(f"{number} records of {light.size} samples", _BYTES_PER_SAMPLE * number * light.size, "take fewer")
     power, background = 10**-density * light, np.broadcast_to(10**-density * sky, light.shape[:-1])
@@ -362,64 +384,13 @@ def _record_channel(
     return label(xr.Dataset(values, {**coords, **axes}, attributes), **dict.fromkeys(sampled, receiver.units))
 
 
-def saturation_advice(recorded: xr.Dataset) -> str:
-    """Return a sentence on the saturation in a record from `detect_waveforms`, and on how to avoid it."""
-    saturated = recorded["saturated"]
-    share = float(saturated.any([dim for dim in saturated.dims if dim != "shot"]).mean())
-    if share == 0:
-        return "no sample is saturated"
-    text = f"{_percent(share)} of the shots have saturated samples"
-    if {"fitting_optical_density", "fitting_gain"} <= recorded.attrs.keys():
-        density = float(np.max(recorded.attrs["fitting_optical_density"]))
-        text += f": a filter of optical density {density:.1f} (factor {10**density:.3g})"
-        gain = float(np.min(recorded.attrs["fitting_gain"]))
-        text += f" or a gain of {gain:.3g} would fit" if gain > 0 else " would fit"
-    return text
-
-
-def describe_recording(recorded: xr.Dataset) -> list[str]:
-    """Return lines on a record of `detect_waveforms`: gain and filter as used, and saturation in total and by pixel."""
-    if "gate" in recorded.dims:
-        return describe_frames(recorded)
-    attributes = recorded.attrs
-    used = ", ".join(
-        f"{name.replace('_', ' ')} {_span(attributes[name])}{' (auto)' if name in attributes['chosen'] else ''}"
-        for name in ("gain", "optical_density")
-    )
-    count = recorded.sizes["shot"]
-    lines = [
-        f"{count} shot{'s' * (count != 1)}, receiver {attributes.get('receiver', 'custom')}, {used}",
-        saturation_advice(recorded),
-    ]
-    if "block_level" in recorded:
-        lines.append(f"{_percent(float(recorded['signal'].notnull().mean()))} of the samples are stored in blocks")
-    shots, samples = recorded["saturated_shots"], recorded["saturated_samples"]
-    if not shots.any():
-        return lines
-    if shots.dims != ("pixel",) or shots.size > _LISTED_PIXELS:
-        most = f"{_percent(float(shots.max()))} of its shots, {_percent(float(samples.max()))} of its samples"
-        return [*lines, f"most saturated pixel: {most}"]
-    for name, of_shots, of_samples in zip(recorded["pixel"].values, shots.values, samples.values, strict=True):
-        lines.append(f"saturated in {name}: {_percent(of_shots)} of the shots, {_percent(of_samples)} of the samples")
-    return lines
-
-
-def _span(values: float | list[float]) -> str:
-    """Return a number, or the least and the largest one of a list."""
-    low, high = np.min(values), np.max(values)
-    return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
-
-
 def _in_range(
-    channel: Channel, light: FloatArray, width: float, sky: FloatArray, advice: bool
+    channel: Channel, light: FloatArray, width: float, sky: FloatArray, advice: bool, series: bool
 ) -> tuple[ReceiverChain, float, dict[str, float | str]]:
     """Return the chain with its gain, the optical density of the filter, and attributes with those that fit.
 
-    Without `advice` only those that are automatic are sought.
+    Without `advice` only those that are automatic are sought. They suit all shots of a series but a share of
+    `SATURATING`.
     """
     chain, gain, density = channel.chain, channel.gain, channel.optical_density
     if gain == density == "auto":
@@ -427,10 +398,13 @@ def _in_range(
     if chain.amplifier is None and "auto" in (gain, density):
         name = "gain" if gain == "auto" else "optical_density"
         raise UserError(f"{name} = 'auto' needs a receiver with an amplifier: without one, nothing saturates")
-    background = np.broadcast_to(sky, light.shape[:-1])
+    background, fitting = np.broadcast_to(sky, light.shape[:-1]), dict[str, float | str]()
+    spared = int(SATURATING * len(light)) if series else 0
+    if advice or "auto" in (gain, density):
+        fitting["saturating_share"] = spared / len(light)
+        light, background = chain.without_brightest(light, width, background, spared)
     chosen = 0.0 if density == "auto" else in_range("optical_density", density, 0, DENSEST)
     used = chain if gain in ("auto", 1) else chain.with_gain(finite("gain", gain))
-    fitting: dict[str, float | str] = {}
     if advice or density == "auto":
         attenuation = used.fitting_attenuation(light, width, background)
         if math.isfinite(attenuation):

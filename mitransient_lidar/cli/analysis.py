@@ -104,7 +104,7 @@ def _record(
     target = output or file.with_name(f"{file.stem}_recorded.nc")
     check_suffix("--output", target, ".nc")
     from mitransient_lidar import results
-    from mitransient_lidar.analysis import receiver as analysis
+    from mitransient_lidar.analysis import recorded as analysis
 
     with reporting(quiet):
         result = results.dataset_of("FILE", file, "result", "gates")

@@ -16,7 +16,7 @@ from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.flights.las_header import coordinate_system_wkt
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.preparation import telling_errors_alone
-from mitransient_lidar.flights.products import Flown, points_of, write_files
+from mitransient_lidar.flights.products import INFRARED_STORE, Flown, points_of, write_files
 from mitransient_lidar.flights.renderer import FlightRenderer, scene_of
 from mitransient_lidar.rendering.passes import ProgressCallback
 
@@ -57,7 +57,8 @@ def fly(
     flight
         A TOML file, the name of a shipped flight, or a dict of its contents; see docs/guide/flights.md.
     folder
-        Folder of the files: the store ``flight.zarr``, ``points.laz``, ``waveforms.las`` and ``waveforms.wdp``.
+        Folder of the files: the store ``flight.zarr``, ``points.laz``, ``waveforms.las`` and ``waveforms.wdp``, and
+        the store ``infrared.zarr`` of an infrared channel with lines of its own.
     light
         As of `rendering.shots.series.render_shots`; pulses near targets are merged.
     workers, scheduler
@@ -89,6 +90,10 @@ def fly(
     folder = checked_path("folder", folder)
     coordinate_system_wkt(plan.crs, plan.origin[:2])
     store = complete(lambda: _prepare(plan, folder / STORE, shard_size, progress), workers, scheduler, False, progress)
+    if plan.infrared_lines is not None:
+        other = plan.of_infrared()
+        beside = folder / INFRARED_STORE
+        complete(lambda: _prepare(other, beside, shard_size, progress), workers, scheduler, False, progress)
     flown = Flown.of(store)
     with telling_errors_alone():
         points = points_of(flown, plan)

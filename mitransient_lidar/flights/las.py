@@ -52,13 +52,15 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
         - ``gps_time``: time of the pulse [s]; its attribute ``time_system``, of `poses.records.TIME_SYSTEMS`, is
           ``flight`` by default. Those since 1980 become adjusted standard GPS times;
         - ``kind``: class, 0 to 255: 1 an object above the water, 2 land, 40 bottom, 41 water surface, 43 submerged
-          object, 45 no bottom found. The last is flagged as synthetic, since no echo is there;
+          object, 45 no bottom found. The last is flagged as synthetic, since no echo is there. The
+          attribute ``object_class``, 46 or 64, is the class that files have in place of 43, of submerged vegetation;
         - ``intensity``: amplitude, with the attributes ``full_scale``, which becomes 65535, and ``units``; larger ones
           are clipped, negative and missing ones are 0. The scale is that of the first chunk;
         - ``channel``: scanner channel, 0 to 3: the pixel, or a group of pixels where more than four are;
         - ``return_number``, ``number_of_returns``: 1 to 15, of a pulse in a channel;
         - ``scan_angle_deg``: angle of the pulse from nadir, -180 to 180, positive to the right of the heading;
         - ``line``: number of the flight line, 0 to 65535;
+        - ``transmitter``, the user data: 0 green, also if it is missing, 1 the infrared channel;
         - ``pixel``, 0 to 65535, and ``shot``, 0 to 2^32 - 1;
         - ``quality``: sum of `products.Quality`, 0 to 255; ``withheld``: whether maps should leave the point out;
         - ``depth``, negative on land, ``depth_uncertainty``, ``horizontal_uncertainty``, ``vertical_uncertainty`` [m],
@@ -175,15 +177,23 @@ def _time_system(first: xr.Dataset) -> str:
     return str(first["gps_time"].attrs.get("time_system", "flight"))
 
 
+def _object_class(points: xr.Dataset) -> int:
+    """Return the class of echoes between surface and bottom."""
+    return int(points["kind"].attrs.get("object_class", PointClass.OBJECT))
+
+
 def _notes(first: xr.Dataset) -> str:
     intensity = first["intensity"].attrs
     step = positive("full_scale", intensity["full_scale"]) / _LAST_INTENSITY
+    of_object = _object_class(first)
+    objects = "object" if of_object == PointClass.OBJECT else "vegetation"
     return (
         f"Simulated by mitransient-lidar. Intensity: 1 is {step:.9g} {intensity['units']}. "
         f"GPS time: {TIME_NOTES[_time_system(first)]}. "
-        "Class 1 object above the water, 2 land, 40 bottom, 41 water surface, 43 submerged object, "
+        f"Class 1 object above the water, 2 land, 40 bottom, 41 water surface, {of_object} submerged {objects}, "
         "45 no bottom found (flagged synthetic: "
-        "no echo is there). The scanner channel is the pixel, or one of four groups of more pixels. "
+        "no echo is there). User data: 0 green, 1 infrared channel. "
+        "The scanner channel is the pixel, or one of four groups of more pixels. "
         "Return numbers count the echoes of a pulse in one channel; the fifteenth may be several. "
         "Quality: 1 saturated, 2 poor fit, 4 corrected depth, 8 beyond the table of corrections, "
         "16 surface and bottom merged, 32 above the water, 64 class below 90 % probable, 128 surface from infrared. "
@@ -255,7 +265,7 @@ def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float)
         **{name: _coordinate(points, name.lower(), offset) for name, offset in zip("XYZ", offsets, strict=True)},
         "gps_time": finite_array("gps_time", points["gps_time"].values)
         - ADJUSTMENT_S * (_time_system(points) == "gps"),
-        "classification": kind,
+        "classification": np.where(kind == PointClass.OBJECT, _object_class(points), kind),
         "synthetic": kind == PointClass.NO_ECHO,
         "withheld": points["withheld"].values,
         "quality": _whole(points, "quality", 0, 255),
@@ -267,6 +277,7 @@ def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float)
         "point_source_id": _whole(points, "line", 0, 2**16 - 1),
         "pixel": _whole(points, "pixel", 0, 2**16 - 1),
         "shot": _whole(points, "shot", 0, 2**32 - 1),
+        "user_data": _whole(points, "transmitter", 0, 255) if "transmitter" in points else np.zeros(kind.shape),
         **extra,
     }
 

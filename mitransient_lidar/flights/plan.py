@@ -28,12 +28,17 @@ from mitransient_lidar.flights.refracted_paths import PoseErrors
 from mitransient_lidar.loading.catalogue import with_infrared
 from mitransient_lidar.physics.receiver.receiver_files import Setting
 from mitransient_lidar.rendering.passes import LIGHT, LightOption
+from mitransient_lidar.results.attributes import PointClass
 
 #: Parameters of the scene that the poses of the pulses replace.
 POSE_PARAMETERS = ("aim_x", "aim_y", "altitude", "off_nadir_deg")
 
 #: Most pulses of a flight.
 MOST_PULSES = 1_000_000
+
+#: Classes of echoes between surface and bottom: objects, vegetation of the draft of the second bathymetric profile of
+#: LAS (46), and vegetation as NOAA marked it before (64).
+OBJECT_CLASSES = (int(PointClass.OBJECT), 46, 64)
 
 #: Largest difference of coordinates of one place [m], that of the rounding in files.
 SAME_PLACE_M = 1e-3
@@ -46,6 +51,14 @@ class Pulses(Plan):
     rate_hz: Annotated[float, positive_option("Pulse repetition rate", "Hz")]
     most: Annotated[int, Option("Number of pulses after which the flight ends", 1, MOST_PULSES)] = MOST_PULSES
     every: Annotated[int, Option("Number of the pulses of which one is rendered", 1, 10**9)] = 1
+
+
+@dataclass(frozen=True)
+class InfraredLines(Plan):
+    """Pulses of an infrared channel that has a scanner of its own."""
+
+    scanner: Annotated[Mapping[str, Any], Option("Scanner, as of poses.scanner")]
+    pulses: Annotated[Pulses, Option("Pulses")]
 
 
 @dataclass(frozen=True)
@@ -79,6 +92,9 @@ class FlightPlan(Plan):
     infrared: Annotated[
         bool, Option("Whether the infrared channel of the instrument sends a pulse with each green one")
     ] = False
+    infrared_lines: Annotated[
+        InfraredLines | None, Option("Scanner and pulses of the infrared channel, if it has lines of its own")
+    ] = None
     parameters: Annotated[Mapping[str, Any], Option("Parameters of the scene, but those of the pose")] = field(
         default_factory=dict
     )
@@ -103,6 +119,10 @@ class FlightPlan(Plan):
         float | None,
         positive_option("Longest time for the passes of a batch; shots that it ends have other bits elsewhere", "s"),
     ] = None
+    object_class: Annotated[
+        int,
+        Option("LAS class of echoes between surface and bottom: 43 objects, 46 or 64 submerged vegetation", 0, 255),
+    ] = PointClass.OBJECT
     seed: Annotated[int, Option("Seed of renders and of the receiver's noise", 0, 2**31)] = 1
     still_sea: Annotated[bool, Option("Whether the waves do not move")] = False
     crs: Annotated[str | None, Option("Coordinate system of the points, such as EPSG:32633")] = None
@@ -116,6 +136,13 @@ class FlightPlan(Plan):
         super().__post_init__()
         one_of("estimator", self.estimator, ESTIMATORS)
         one_of("light", self.light, LIGHT)
+        if self.object_class not in OBJECT_CLASSES:
+            allowed = ", ".join(map(str, OBJECT_CLASSES))
+            raise UserError(f"object_class = {self.object_class} must be one of {allowed}")
+        if self.infrared and self.infrared_lines is not None:
+            raise UserError("infrared = true and [infrared_lines] are alternatives: give one of them")
+        if self.infrared_lines is not None:
+            with_infrared(self.instrument, None)
         for name in POSE_PARAMETERS:
             if name in self.parameters:
                 raise UserError(
@@ -125,7 +152,13 @@ class FlightPlan(Plan):
     def of_infrared(self) -> FlightPlan:
         """Return the flight of the infrared channel; raise `UserError` if the instrument has none."""
         _, (channel, parameters) = with_infrared(self.instrument, self.parameters)
-        return replace(self, instrument=channel, parameters=parameters, receiver=FlightReceiver(), infrared=False)
+        if self.infrared_lines is None:
+            return replace(self, instrument=channel, parameters=parameters, receiver=FlightReceiver(), infrared=False)
+        given = json.loads(self.text)
+        lines = given.pop("infrared_lines")
+        own = {key: value for key, value in given.items() if key not in ("receiver", "corrections")}
+        own |= {"instrument": channel, "parameters": parameters, **lines}
+        return FlightPlan.of_file(own, self.folder)
 
     @classmethod
     def read(cls, flight: str | os.PathLike[str]) -> FlightPlan:

@@ -93,6 +93,17 @@ def input_columns(poses: PulsePoses) -> dict[str, Column]:
     return {name: column[order] for name, column in columns.items()}
 
 
+def pilot_rows(inputs: Mapping[str, Column], most: int) -> IntArray:
+    """Return the rows of pilot pulses, spread over the groups and the angles from nadir of a flight's pulses.
+
+    So those of flights with the same scanner and height look alike, however many pulses they have.
+    """
+    order = np.lexsort((np.round(inputs["axis_z"], 6), inputs["group"]))
+    count = min(order.size, most)
+    chosen: IntArray = order[((np.arange(count) + 0.5) * order.size / count).astype(int)]
+    return chosen
+
+
 def axis_of(plan: FlightPlan, source: SceneSource, inputs: Mapping[str, Column]) -> tuple[TimeAxis, int]:
     """Return time bins that hold the light of pulses of one group, relative to the lidar of the group.
 
@@ -215,17 +226,15 @@ def warn_of_maps(beyond: int, pulses: int) -> None:
         )
 
 
-def tell_forecast(saturated: int, sampled: int, pulses: int, seconds: float) -> None:
-    """Log how many pulses of a sample saturate, and the processor time of a flight by that of one of them [s]."""
-    if saturated:
-        _LOG.warning(
-            "%d of %d sampled pulses saturate the receiver, %.0f %% of the flight; saturated echoes are withheld, "
-            "and gain = 'auto' in [receiver] avoids most of it",
-            *(saturated, sampled, 100 * saturated / sampled),
-        )
+def tell_forecast(saturated: int, sampled: int, is_automatic: bool, pulses: int, seconds: float) -> None:
+    """Log how many pilot pulses saturate, and the processor time of a flight by that of one of them [s]."""
+    share = 100 * saturated / sampled
+    text = f"{saturated} of {sampled} pilot pulses saturate the receiver, {share:.0f} % of the flight"
+    if saturated and not is_automatic:
+        _LOG.warning("%s; saturated echoes are withheld, and gain = 'auto' in [receiver] avoids most of it", text)
     else:
-        _LOG.info("none of %d sampled pulses saturates the receiver", sampled)
-    _LOG.info("%d pulses take about %.0f s of processor time, estimated from the sample", pulses, pulses * seconds)
+        _LOG.info("%s", text)
+    _LOG.info("%d pulses take about %.0f s of processor time, estimated from the pilots", pulses, pulses * seconds)
 
 
 def lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]:

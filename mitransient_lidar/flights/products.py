@@ -28,7 +28,7 @@ from mitransient_lidar.flights.preparation import beyond_angles
 from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.level_sea import cos_in_water
 from mitransient_lidar.physics.lidar.pose import Pose
-from mitransient_lidar.results.attributes import PointClass, flagged, label
+from mitransient_lidar.results.attributes import PointClass, described, flagged, label
 from mitransient_lidar.results.geometry import lidar_system
 
 #: Pulses of a chunk of a file.
@@ -42,6 +42,9 @@ _CERTAIN = 0.9
 
 #: Rows of the printed table that are left out without points.
 _IF_ANY = ("land", "above the water", "bottom, merged", "withheld")
+
+#: Store of the infrared channel with lines of its own, beside that of the flight.
+INFRARED_STORE = "infrared.zarr"
 
 #: Variables of the store that tell the truth of a shot, and their names among those of points.
 _TRUTH = ("true_surface_height", "true_bottom_depth", "true_bottom_depth_below_surface")
@@ -167,8 +170,13 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     ``withheld``, whether the echo is saturated or its fit poor; ``pseudo_reflectance``, ``optical_depth`` and
     ``class_probability``; and the truth: ``true_z`` [m], the mean height of the surface in the beam or, for points
     below it, that of the highest solid at x and y; ``true_target``, whether that solid is a target; and of the pulse
-    ``true_surface_height``, ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m].
+    ``true_surface_height``, ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m]. The points of an
+    infrared channel with lines of its own follow, with the ``transmitter`` 1 and numbers of their own as ``shot``; the
+    surface is then that of both channels.
     """
+    infrared = None
+    if plan.infrared_lines is not None:
+        infrared = points_of(Flown.of(Store(flown.store.path.parent / INFRARED_STORE)), plan.of_infrared())
     echoes = echoes_of(flown, plan.corrections)
     attributes = flown.attributes
     angles = [1e-3 * flown.coordinate(name) for name in ("sight_x", "sight_y")]
@@ -181,17 +189,29 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
         "time_s": time_s,
     }
     points = positions(echoes, poses, *angles, **options)
-    if np.any(points["kind"].values == PointClass.SURFACE):
+    measured = points if infrared is None else _joined(points, infrared)
+    if np.any(measured["kind"].values == PointClass.SURFACE):
         width = float(attributes.get("divergence_mrad", 1.0)) * 1e-3 * float(np.mean(poses.origin[:, 2]))
-        surface = fit_surface(points, mean_slope(attributes, width), plan.surface_radius)
+        surface = fit_surface(measured, mean_slope(attributes, width), plan.surface_radius)
         points = positions(echoes, poses, *angles, surface=surface, **options)
     shot = points["shot"].values
     points["scan_angle_deg"] = ("point", flown.values("scan_angle_deg")[shot])
     points["line"] = ("point", flown.values("line")[shot])
-    infrared = flown.values("infrared_surface") if plan.infrared else np.zeros(len(time_s), dtype=bool)
-    points = points.assign(_quality(points, echoes, infrared)).assign(_of_light(flown, points, echoes))
+    by_infrared = flown.values("infrared_surface") if plan.infrared else np.zeros(len(time_s), dtype=bool)
+    points = points.assign(_quality(points, echoes, by_infrared)).assign(_of_light(flown, points, echoes))
     points.attrs["merged_below_m"] = float(attributes["merged_below_m"])
-    return label(points.assign(_truth(flown, plan, points)), "points")
+    points = label(points.assign(_truth(flown, plan, points)), "points")
+    return points if infrared is None else _joined(points, infrared)
+
+
+def _joined(points: xr.Dataset, infrared: xr.Dataset) -> xr.Dataset:
+    """Return the points of both channels, with their ``transmitter``."""
+    both = [
+        one.assign(transmitter=("point", np.full(one.sizes["point"], number), described("transmitter")))
+        for number, one in enumerate((points, infrared))
+    ]
+    names = [name for name in both[0] if name in both[1]]
+    return xr.concat([one[names] for one in both], "point", combine_attrs="override")
 
 
 def read_points(path: Path) -> xr.Dataset:
@@ -281,6 +301,10 @@ def _of_light(flown: Flown, points: xr.Dataset, echoes: xr.Dataset) -> dict[str,
 
 def describe_points(points: xr.Dataset) -> list[str]:
     """Return the lines of a table of points by class: numbers, and errors of their heights against the truth [cm]."""
+    if "transmitter" in points:
+        green, infrared = (points.isel(point=points["transmitter"].values == one) for one in (0, 1))
+        names = [name for name in points if name != "transmitter"]
+        return [*describe_points(green[names]), "", "Infrared channel", *describe_points(infrared[names])]
     columns = [("class", "<22"), ("points", ">9"), *((name, ">8.1f") for name in ("bias", "spread", "rms", "stated"))]
     error = points["z"].values - points["true_z"].values
     stated = points["vertical_uncertainty"].values
@@ -359,6 +383,7 @@ def write_files(flown: Flown, plan: FlightPlan, points: xr.Dataset, folder: Path
     placed = points.copy()
     for name, first in zip("xyz", plan.origin, strict=True):
         placed[name] = placed[name] + first
+    placed["kind"].attrs["object_class"] = plan.object_class
     placed = with_channels(placed, len(flown.coordinate("pixel")))
     placed["gps_time"].attrs["time_system"] = plan.time_system(flown.values("time_s"))
     # The amplitude of a clipped echo is what its flanks make of it.
@@ -367,7 +392,8 @@ def write_files(flown: Flown, plan: FlightPlan, points: xr.Dataset, folder: Path
     placed["intensity"].attrs["full_scale"] = brightest or 1.0
     paths = [folder / "points.laz", folder / "waveforms.las", folder / "waveforms.wdp"]
     write_points(paths[0], placed, plan.crs)
-    write_waveforms(paths[1], _with_packets(flown, placed), _packets(flown), plan.crs)
+    green = placed.isel(point=placed["transmitter"].values == 0) if "transmitter" in placed else placed
+    write_waveforms(paths[1], _with_packets(flown, green), _packets(flown), plan.crs)
     return paths
 
 
@@ -380,6 +406,8 @@ def with_channels(points: xr.Dataset, pixels: int) -> xr.Dataset:
     pixel, shot = points["pixel"].values, points["shot"].values
     if pixels <= MOST_CHANNELS:
         return points.assign(channel=("point", pixel))
+    if "transmitter" in points:
+        shot = shot + 2**32 * points["transmitter"].values
     channel = pixel * MOST_CHANNELS // pixels
     order = np.lexsort((-points["z"].values, channel, shot))
     found = {"channel": channel}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
 from scipy.ndimage import uniform_filter1d
 
-from mitransient_lidar.analysis.receiver import detect_waveforms, receiver_of_result
+from mitransient_lidar.analysis.receiver import detect_waveforms, receiver_of_result, shared_settings
 from mitransient_lidar.campaigns.design import Column
 from mitransient_lidar.core.validation import IntArray
 from mitransient_lidar.flights.plan import FlightPlan
@@ -38,45 +38,17 @@ def record(series: xr.Dataset, plan: FlightPlan, inputs: Mapping[str, Column]) -
     )
 
 
-def chosen_settings(probes: Iterable[xr.Dataset], plan: FlightPlan) -> dict[str, float]:
-    """Return the settings of automatic channels, as inputs of pulses: those with which no probe saturates.
-
-    `probes`: rendered pulses of the flight, in parts. `plan`: the flight.
-    """
-    gains: dict[int, float] = {}
-    densities: dict[int, float] = {}
-    for series in probes:
-        receiver = _receiver(series, plan)
-        recorded = detect_waveforms(series, receiver, background_power=plan.receiver.background_power_w, advice=False)
-        pixels = recorded["pixel"].values
-        used = (np.broadcast_to(recorded.attrs[name], len(pixels)) for name in ("gain", "optical_density"))
-        for pixel, gain, density in zip(pixels, *used, strict=True):
-            channel = receiver.of(str(pixel))
-            if "auto" in (channel.gain, channel.optical_density):
-                number = receiver.number_of(str(pixel))
-                gains[number] = min(float(gain), gains.get(number, np.inf))
-                densities[number] = max(float(density), densities.get(number, 0.0))
-    return {
-        f"{name}{number}": value
-        for name, values in zip(SETTINGS, (gains, densities), strict=True)
-        for number, value in values.items()
-    }
+def chosen_settings(pilots: xr.Dataset, plan: FlightPlan) -> dict[str, float]:
+    """Return the settings of automatic channels for rendered pilot pulses of a flight, as inputs of its pulses."""
+    found = shared_settings(pilots, _receiver(pilots, plan), plan.receiver.background_power_w)
+    return {f"{name}{number}": one for number, used in found.items() for name, one in zip(SETTINGS, used, strict=True)}
 
 
-def saturated_pulses(probes: Iterable[xr.Dataset], plan: FlightPlan, settings: Mapping[str, float]) -> int:
+def saturated_pulses(pilots: xr.Dataset, plan: FlightPlan, settings: Mapping[str, float]) -> int:
     """Return how many of rendered pulses have saturated samples, with the settings of automatic channels."""
-    count = 0
-    for series in probes:
-        inputs = {"pulse": np.zeros(1, dtype=np.int64), **{name: np.array([value]) for name, value in settings.items()}}
-        saturated = record(series, plan, inputs)["saturated"]
-        count += int(np.count_nonzero(saturated.any([dim for dim in saturated.dims if dim != "shot"])))
-    return count
-
-
-def has_automatic_settings(plan: FlightPlan, instrument: str | None) -> bool:
-    """Return whether the receiver of a flight with the scene's instrument chooses a gain or a filter."""
-    receiver = _receiver(xr.Dataset(attrs={"instrument": instrument or ""}), plan)
-    return any("auto" in (channel.gain, channel.optical_density) for channel in receiver.all_channels)
+    inputs = {"pulse": np.zeros(1, dtype=np.int64), **{name: np.array([value]) for name, value in settings.items()}}
+    saturated = record(pilots, plan, inputs)["saturated"]
+    return int(np.count_nonzero(saturated.any([dim for dim in saturated.dims if dim != "shot"])))
 
 
 def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray, passes: IntArray) -> xr.DataArray:

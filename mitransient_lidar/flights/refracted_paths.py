@@ -14,6 +14,9 @@ from mitransient_lidar.core.validation import BoolArray, FloatArray, finite_arra
 from mitransient_lidar.flights.sea_surface import Facets, SurfaceModel
 from mitransient_lidar.physics.lidar.level_sea import cos_in_water, refract
 
+#: Ratio of errors from which a pulse's own surface replaces a plane through several.
+_CLEARLY = 2.0
+
 
 @dataclass(frozen=True)
 class PoseErrors(Plan):
@@ -128,8 +131,8 @@ class RefractedPaths:
         indices
             Refractive and group index.
         surface
-            The sea. Points in the water are behind its planes, if it has some, and else behind R_s, with a level
-            surface; those of pulses without an echo are on the surface.
+            The sea. Points in the water are behind its planes, if it has some, but behind R_s where it has less than
+            half of the error of the plane's height; those of pulses without an echo are on the surface.
         time_s
             Times [s], shape (n,).
         """
@@ -139,6 +142,8 @@ class RefractedPaths:
         distance = np.where(silent, level, timing.surface_range)
         place = origin + distance[:, None] * direction
         facets = surface.at(place[:, :2], time_s)
+        own = np.hypot(timing.surface_noise, timing.surface_method) * -direction[:, 2]
+        on_model = silent | (on_model & ~((own > 0) & (_CLEARLY * own < facets.height_error)))
         # Where the line of sight meets the plane at `place`.
         normal = np.column_stack([-facets.slope, np.ones(len(place))])
         above = place[:, 2] - facets.height

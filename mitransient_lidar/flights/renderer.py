@@ -21,7 +21,7 @@ from mitransient_lidar.campaigns.design import Column
 from mitransient_lidar.campaigns.runs import Array, Renderer, plain
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.plan import POSE_PARAMETERS, FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
 from mitransient_lidar.flights.poses.records import tell_time_system
@@ -29,6 +29,7 @@ from mitransient_lidar.flights.preparation import (
     axis_of,
     input_columns,
     lidar_of,
+    pilot_rows,
     shot_poses,
     tell_forecast,
     telling_errors_alone,
@@ -38,7 +39,6 @@ from mitransient_lidar.flights.preparation import (
 from mitransient_lidar.flights.recording import (
     SETTINGS,
     chosen_settings,
-    has_automatic_settings,
     pooled_errors,
     record,
     saturated_pulses,
@@ -65,9 +65,8 @@ _OF_INFRARED = ("infrared_start_ns", "infrared_bins")
 #: Rounding of times over the time in which waves stand still.
 _ROUNDING = 1e-6
 
-#: Pulses of a flight that automatic settings of its receiver are chosen from, those of another one that are sampled
-#: before it, and passes of each.
-_PROBES, _SAMPLED, _PROBE_PASSES = 128, 64, 4
+#: Pilot pulses that are rendered together.
+_PILOTS_TOGETHER = 64
 
 #: Passes of pulses whose light is looked up in maps.
 _MAP_PASSES = 2
@@ -125,15 +124,11 @@ class FlightRenderer(Renderer):
             columns["record_start_ns"] = start
             if other is not None:
                 columns |= dict(zip(_OF_INFRARED, (infrared[0], np.full(start.size, infrared[1].max())), strict=True))
-            is_automatic = has_automatic_settings(plan, scene.instrument)
-            probes = renderer._probes(columns, _PROBES if is_automatic else _SAMPLED, progress)
-            settings = chosen_settings((series for series, _ in probes), plan) if is_automatic else {}
-            saturated = saturated_pulses((series for series, _ in probes), plan, settings)
+            pilots, seconds = renderer._pilots(columns, progress)
+            settings = chosen_settings(pilots, plan)
+            saturated = saturated_pulses(pilots, plan, settings)
         columns |= {name: np.full(start.shape, value) for name, value in settings.items()}
-        sampled = sum(series.sizes["shot"] for series, _ in probes)
-        # The first part compiles kernels.
-        seconds = float(np.quantile([seconds for _, seconds in probes], 0.5, method="lower"))
-        tell_forecast(saturated, sampled, start.size, seconds)
+        tell_forecast(saturated, pilots.sizes["shot"], bool(settings), start.size, seconds)
         return renderer, columns
 
     def describe_input(self, name: str, column: Column) -> dict[str, Any]:
@@ -226,36 +221,39 @@ class FlightRenderer(Renderer):
     def _passes(self, *, until_error: bool) -> tuple[int, float, float | None]:
         """Return the most passes of pulses, the share of the paths of a full one, and the error that ends them."""
         from mitransient_lidar.rendering.shots.batches import MOST_PASSES_FOR_ERROR, share_for_error
+        from mitransient_lidar.rendering.shots.pilots import MERGED_PASSES
 
         error = self.plan.target_error
         share = share_for_error(error)
-        return (MOST_PASSES_FOR_ERROR, share, error) if until_error else (_PROBE_PASSES, share, None)
+        return (MOST_PASSES_FOR_ERROR, share, error) if until_error else (MERGED_PASSES, share, None)
 
-    def _probes(
-        self, columns: Mapping[str, Column], most: int, progress: ProgressCallback | None
-    ) -> list[tuple[xr.Dataset, float]]:
-        """Return the waveforms of pulses that are spread over the flight, those of a group together, over one sea.
+    def _pilots(self, columns: Mapping[str, Column], progress: ProgressCallback | None) -> tuple[xr.Dataset, float]:
+        """Return the waveforms of pilot pulses: of `pilot_rows`, at the same places of the sea in all flights.
 
-        Each part has the processor time of a pulse with as many passes as its error needs [s].
+        Beside them is the processor time of a pulse of the flight, with as many passes as its error needs [s].
         """
-        count = len(columns["pulse"])
-        rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+        from mitransient_lidar.rendering.shots.pilots import PILOTS
+
+        rows = pilot_rows(columns, PILOTS)
+        group = columns["group"][rows]
         found: list[tuple[xr.Dataset, float]] = []
-        for group in np.unique(columns["group"][rows]):
-            own = rows[columns["group"][rows] == group]
-            for part in np.array_split(own, -(-own.size // _SAMPLED)):
-                inputs = {name: column[part] for name, column in columns.items()}
-                inputs["time_s"] = np.full(part.size, inputs["time_s"][0])
+        for one in np.unique(group):
+            own = np.flatnonzero(group == one)
+            for part in np.array_split(own, -(-own.size // _PILOTS_TOGETHER)):
+                inputs = {name: column[rows[part]] for name, column in columns.items()}
+                inputs |= {"pulse": part, "time_s": np.zeros(part.size)}
                 self._scene_of(inputs)
                 began = time.process_time()
-                series, _, errors = self._render(inputs, self._passes(until_error=False))
+                series, _, errors = self._render(inputs, self._passes(until_error=False), part)
                 took = (time.process_time() - began) / part.size
                 error = float(np.median(errors))
                 found.append((series, took * max((error / self.plan.target_error) ** 2, 1.0)))
                 if progress is not None:
                     done = sum(one.sizes["shot"] for one, _ in found)
                     progress(Progress(done=done, planned=rows.size, unit="sampling pulse"))
-        return found
+        # The first part compiles kernels.
+        seconds = float(np.quantile([seconds for _, seconds in found], 0.5, method="lower"))
+        return xr.concat([one for one, _ in found], "shot", coords="minimal", compat="override"), seconds
 
     def _scene_of(self, inputs: Mapping[str, Column], light: str | None = None) -> ShotScene:
         """Return the loaded scene of the lidar of pulses of one group, by default for the light of the flight."""
@@ -278,13 +276,17 @@ class FlightRenderer(Renderer):
         return recorded.assign_coords(LinesOfSight(**arrays).coordinates(("shot", "pixel"), arrays["off_nadir"].shape))
 
     def _render(
-        self, inputs: Mapping[str, Column], passes: tuple[int, float, float | None]
+        self,
+        inputs: Mapping[str, Column],
+        passes: tuple[int, float, float | None],
+        pilots: IntArray | None = None,
     ) -> tuple[xr.Dataset, FloatArray, FloatArray]:
         """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns].
 
-        The last array are the relative errors of the bins that count.
+        The last array are the relative errors of the bins that count. `pilots`: numbers of pilot pulses.
         """
         from mitransient_lidar.rendering.shots.batches import ReceivedShots, suits_maps
+        from mitransient_lidar.rendering.shots.pilots import PILOTS, pilot_sea
         from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
 
         plan = self.plan
@@ -296,6 +298,8 @@ class FlightRenderer(Renderer):
         sea = sea_of(scene.session.scene)
         if not plan.still_sea:
             poses = replace(poses, times_s=_STILL_S * (np.floor(inputs["time_s"] / _STILL_S + _ROUNDING) + 0.5))
+        if pilots is not None and (at_sea := pilot_sea(sea, PILOTS)) is not None:
+            poses = replace(poses, other_sea=(at_sea[0][pilots], at_sea[1][pilots]))
         pulses = inputs["pulse"].astype(np.int64)
         by_maps = suits_maps(scene.lidar, poses) if plan.light == "maps" else np.zeros(len(poses), dtype=bool)
         rendered, rows = [], []

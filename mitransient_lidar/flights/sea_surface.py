@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
+from scipy.stats import chi2
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, non_negative, positive
@@ -21,6 +22,8 @@ _MOST_NEIGHBOURS, _ROWS = 24, 20_000
 _SAMPLES, _RESIDUALS = 1000, 2.0 ** np.arange(-8, 1)
 #: Wave number of the waves that planes do not follow, times the root mean square distance of a plane's points.
 _WAVE_NUMBER = 1.5
+#: Probability of a smaller variance of heights than that of the points, one standard deviation below.
+_CHANCE = 0.16
 #: Smallest standard deviations of heights [m] and slopes [1], so that precise points have finite weights.
 _LEAST_ERROR, _LEAST_SLOPE = 1e-6, 1e-9
 
@@ -97,12 +100,12 @@ class SurfaceModel:
         Notes
         -----
         The level is the mean with the weights 1/(error^2 + v), where v is the variance of the waves' heights, that of
-        the points less that of their errors. A plane h + s . (r_i - r) is fitted at a place r to the at most 24 nearest
-        points within the radius, with the weights 1/(error_i^2 + residual^2) and the prior distributions h ~ N(level,
-        v), s ~ N(0, slope_deviation^2): where points are few, or their errors large, it stays level. Times count as
-        distances of 5 m/s. The residual is the most likely one of heights that are predicted from their neighbours; the
-        sea deviates from a plane by it, and its slopes by 1.5 residuals over the root mean square distance of the
-        plane's points.
+        the points, increased by one standard deviation of its error, less that of their errors. A plane h + s . (r_i -
+        r) is fitted at a place r to the at most 24 nearest points within the radius, with the weights 1/(error_i^2 +
+        residual^2) and the prior distributions h ~ N(level, v), s ~ N(0, slope_deviation^2): where points are few, or
+        their errors large, it stays level. Times count as distances of 5 m/s. The residual is the most likely one of
+        heights that are predicted from their neighbours; the sea deviates from a plane by it, and its slopes by 1.5
+        residuals over the root mean square distance of the plane's points.
 
         Measured over linear waves of winds of 3, 6 and 9 m/s, averaged over beams of 0.6 and 2 m, from 0.5 to 10 points
         a square metre with errors of 2 to 15 cm, 72 cases: the slopes that are left have 0.24 to 1.02 of the standard
@@ -121,7 +124,10 @@ class SurfaceModel:
         if np.any(sigma < 0):
             raise UserError(f"error = {sigma.min():g} must not be negative")
         sigma, z = np.maximum(sigma, _LEAST_ERROR), table[:, 2]
-        waves = max(float(np.var(z) - np.mean(sigma**2)), 0.0)
+        # That of few points may be larger by chance.
+        freedom = len(z) - 1
+        most = np.var(z) * len(z) / chi2.ppf(_CHANCE, freedom) if freedom else 0.0
+        waves = max(float(most - np.mean(sigma**2)), 0.0)
         weight = 1 / (sigma**2 + waves)
         level = cls(
             float(np.sum(weight * z) / np.sum(weight)),

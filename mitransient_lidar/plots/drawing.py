@@ -64,11 +64,11 @@ def make_legible(figure: Figure, renderer: Any) -> None:
                 axis.set_tick_params(which="both", labelsize=least)
     for text in figure.findobj(Text):
         text.set_fontsize(max(float(text.get_fontsize()), least))
-    layout = figure.get_layout_engine()
-    if figure.axes and layout:
+    legends = [(ax, legend) for ax in figure.axes if (legend := ax.get_legend())]
+    if legends and (layout := figure.get_layout_engine()):
         layout.execute(figure)
-    for ax in figure.axes:
-        if (legend := ax.get_legend()) and _hides_data(ax, legend.get_window_extent(renderer)):
+    for ax, legend in legends:
+        if _hides_data(ax, legend.get_window_extent(renderer)):
             legend.set_loc("upper left")
             legend.set_bbox_to_anchor((1.0, 1.0))
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.options import Option, declared, positive_option
+from mitransient_lidar.core.options import Option, declared, one_of, positive_option
 from mitransient_lidar.core.validation import FloatArray
 
 #: Largest number of passes allowed.
@@ -73,16 +73,15 @@ Smooth = Annotated[
         *(0.2, 20),
     ),
 ]
-#: Ways to compute the light of shots.
+#: Ways to compute the light.
 LIGHT = ("merging", "maps")
-LightOption = Annotated[
-    str,
-    Option(
-        "Computation of the light: merging (the default), or maps of the beam at several depths: several times "
-        "faster, within 1 %",
-        form="|".join(LIGHT),
-    ),
-]
+_LIGHT = Option(
+    "Computation of the light: merging (the default), or maps of the beam at several depths: several times faster, "
+    "within 1 %",
+    form="|".join(LIGHT),
+)
+LightOption = Annotated[str, _LIGHT]
+Light = Annotated[str | None, _LIGHT]
 Variant = Annotated[str | None, Option("Mitsuba variant, e.g. llvm_ad_mono")]
 
 #: Options that results keep, and the attributes that hold them.
@@ -107,6 +106,7 @@ class RenderOptions:
     derivatives: Derivatives = None
     batches: Batches = None
     smooth: Smooth = None
+    light: Light = None
     variant: Variant = None
 
     def __post_init__(self) -> None:
@@ -119,6 +119,9 @@ class RenderOptions:
             raise UserError(
                 f"target_quantile = {self.target_quantile:g} needs a target_error: the error that it must reach"
             )
+        one_of("light", self.light or LIGHT[0], LIGHT)
+        if self.light == "maps" and self.derivatives:
+            raise UserError("light = 'maps' has no derivatives: use light = 'merging'")
         if self.smooth is not None and (self.components or self.derivatives or self.batches):
             raise UserError(
                 f"smooth = {self.smooth:g} keeps gates alone: leave out components, derivatives and batches"

@@ -28,6 +28,7 @@ from mitransient_lidar.rendering.passes import (
     Components,
     Derivatives,
     Goal,
+    Light,
     MaxMemory,
     MaxTime,
     Passes,
@@ -42,12 +43,14 @@ from mitransient_lidar.rendering.passes import (
     warn_of_edge_loss,
 )
 from mitransient_lidar.rendering.passive import render_passive
-from mitransient_lidar.rendering.scene_checks import check_scene
+from mitransient_lidar.rendering.scene_checks import check_scene, warn_of_shadows
 from mitransient_lidar.rendering.shots.frames import render_frames
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.attributes import join, split
-from mitransient_lidar.transport.paths.passes import check_solids
+from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
+from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, check_solids
 from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 if TYPE_CHECKING:
     import xarray
@@ -80,6 +83,7 @@ def render(
     derivatives: Derivatives = None,
     batches: Batches = None,
     smooth: Smooth = None,
+    light: Light = None,
     variant: Variant = None,
     progress: ProgressCallback | None = None,
     **others: Any,
@@ -132,6 +136,10 @@ def render(
         Standard deviation of a Gaussian that smooths each gate's image in each pass, 0.2 to 20 pixels; none by default.
         Standard errors refer to the smoothed images. Only gates are kept, and passes have fewer paths by default. The
         coordinate ``gate_smoothing_bias`` estimates the change by smoothing.
+    light
+        'merging' (the default), the integrator, or 'maps': the light of the beam is looked up in maps at several depths
+        (`transport.light_maps.renderer`). For images over waves, layers of one index and a bottom; shadows of targets
+        in the beam are left out.
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here. The previously
         active variant is active again afterwards.
@@ -224,7 +232,10 @@ def _render(
     if components:
         check_solids(sum(not shape.is_medium_transition() for shape in session.scene.shapes()))
     sensor, chosen = session.sensor, choose_integrator(session.scene, integrator)
-    renderer = chosen.prepare(session.scene, sensor)
+    if options.light == "maps":
+        renderer: PassRenderer = LightMapRenderer(find_lidar_scene(session.scene, sensor), PathClasses(), image=True)
+    else:
+        renderer = chosen.prepare(session.scene, sensor)
     if components:
         renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
@@ -236,6 +247,8 @@ def _render(
         renderer = renderer.perturbed(changes)
     window = ErrorWindow.of_probe(renderer.probe)
     check_scene(renderer.probe)
+    if options.light == "maps":
+        warn_of_shadows(lidar)
     described = describe_scene(renderer.probe, window, renderer.focusing)
     origins = renderer.classes.names if components else []
     surface = described.get("surface_time_ns")
@@ -292,6 +305,7 @@ def _render(
         **({"derivatives": [one.name for one in parameters]} if parameters else {}),
         **({"batches": options.batches} if options.batches else {}),
         **({"smooth_pixels": options.smooth} if options.smooth else {}),
+        **({"light": options.light} if options.light == "maps" else {}),
         elapsed_s=log.elapsed_s,
         error_median=log.error_median,
         error_p95=log.error_p95,

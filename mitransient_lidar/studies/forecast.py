@@ -22,7 +22,7 @@ from mitransient_lidar.analysis.depth_uncertainty import (
     order_met,
     sounding_uncertainty,
 )
-from mitransient_lidar.analysis.receiver import detect_waveforms, receiver_of_result
+from mitransient_lidar.analysis.receiver import SATURATING, detect_waveforms, receiver_of_result, shared_settings
 from mitransient_lidar.analysis.waveforms.depth_correction import (
     AXES,
     correct_depths,
@@ -45,7 +45,8 @@ from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.rendering.passes import ProgressCallback
-from mitransient_lidar.rendering.shots.batches import ReceivedShots, ShotPoses
+from mitransient_lidar.rendering.shots.batches import ShotPoses
+from mitransient_lidar.rendering.shots.pilots import PILOTS, pilots_over, rendered
 from mitransient_lidar.rendering.shots.scene import ShotScene
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
@@ -192,7 +193,8 @@ def forecast(
         ``order`` that they meet, where at least half of the bottoms are found; and ``deepest``, the depth to which
         these are found in the water of the cell [m], NaN if it lies below the table. All are NaN without data, above
         0.5 m, and on land, where the order is -2; it is -1 where the bottom is lost. The table is in ``table_depth``,
-        ``table_found`` and ``table_tvu``, over ``water`` and ``node``; the receiver's gain in the attribute ``gain``.
+        ``table_found`` and ``table_tvu``, over ``water`` and ``node``; the receiver's gain in the attribute ``gain``,
+        and ``saturating_share``, the share of pulses that may saturate if it is automatic.
 
     Raises
     ------
@@ -203,7 +205,8 @@ def forecast(
     -----
     Bottoms at depths of at most 1.25 times each other, 1.07 times where they get lost, lie under the same places of one
     sea. Their light is looked up in maps (`transport.light_maps.renderer`), or below the reach of these merged, and
-    recorded and searched for echoes as in flights, whose gain is one for all depths. Depths go on until no bottom is
+    recorded and searched for echoes as in flights. Automatic gains are chosen as those of flights, for 128 pilot pulses
+    over the depths of the site. Depths go on until no bottom is
     found, or to the deepest cell. Between waters, numbers are interpolated at the same product of depth and Kd, or
     ratio of depth to Secchi depth.
     """
@@ -225,15 +228,14 @@ def forecast(
     deep &= np.isfinite(water)
     if not deep.any():
         raise UserError(f"{name} = {given!r} must cover cells of the site that are deeper than {_SHALLOWEST} m")
-    (low, high), ends = ((float(one.min()), float(one.max())) for one in (place.depth[deep], water[deep]))
-    waters = _nodes(*ends, _WATERS)
+    waters = _nodes(float(water[deep].min()), float(water[deep].max()), _WATERS)
     table = None if corrections is None else corrections_for(instrument, corrections)
     tables: list[xr.Dataset] = []
     cases = Cases(waters.tolist(), "waters", unit="water", progress=progress)
     for one in cases:
         own = {"wavelength_nm": _WAVELENGTH, **(params or {}), **({} if given is None else {name: one})}
         bottoms = _Bottoms(instrument, scene, own, receiver, shots, records, seed)
-        found = bottoms.table(low, high * (_WATERS if len(waters) > 1 else 1), table)
+        found = bottoms.table(place.depth[deep], _WATERS if len(waters) > 1 else 1.0, table)
         tables.append(cases.keep(sounding_uncertainty(found, TrajectoryErrors(pointing_mrad, position_m, height_m))))
         cases.step()
     dims = tuple(place.coords)
@@ -248,7 +250,12 @@ def forecast(
         **{key: tables[0].attrs[key] for key in ("instrument", "altitude", "off_nadir_deg", "wind_speed", "gain")},
         **{"pointing_mrad": pointing_mrad, "position_m": position_m, "height_m": height_m, "seed": seed},
         **{"title": f"Forecast of {instrument}", "source": f"mitransient-lidar {__version__}", "site": str(site)},
-        **{"shots": shots, "records": records, "water": "" if given is None else f"{name} {given}"},
+        **{
+            "shots": shots,
+            "records": records,
+            "saturating_share": SATURATING,
+            "water": "" if given is None else f"{name} {given}",
+        },
     }
     if place.terrain is not None and place.terrain.origin is not None:
         attributes["map_origin"] = place.terrain.origin
@@ -331,14 +338,17 @@ class _Bottoms:
         session = open_scene(scene, params, instrument)
         self._reach = reach_of_scattering(find_lidar_scene(session.scene, session.sensor))
         self._receiver: ReceiverChannels = receiver_of_result(xr.Dataset(attrs={"instrument": instrument}), receiver)
+        self._scenes: dict[tuple[float, str], ShotScene] = {}
         self._sea: dict[float, Any] = {}
         self._attributes: dict[str, Any] = {}
         self._pixels: list[str] = []
 
-    def table(self, low: float, high: float, corrections: xr.Dataset | None) -> xr.Dataset:
-        """Return a table as of `depth_bias.depth_bias` with the depths that a range needs [m]."""
+    def table(self, site: FloatArray, further: float, corrections: xr.Dataset | None) -> xr.Dataset:
+        """Return a table as of `depth_bias.depth_bias` with the depths that a site needs [m], to a factor further."""
         cells: dict[float, dict[str, Any]] = {}
+        low, high = float(site.min()), further * float(site.max())
         top, deepest = low, min(high, _FIRST, max(self._reach, low))
+        self._choose_settings(site, deepest)
 
         def measure(depths: Sequence[float], sea: float) -> None:
             for depth, recorded in self._recorded(depths, sea):
@@ -365,42 +375,46 @@ class _Bottoms:
         for some in ([near] if near else []) + [[one] for one in depths if one > self._reach]:
             series = self._by_maps(near, min(deepest, self._reach)) if some is near else self._merged(*some)
             series = series.isel(shot=np.isfinite(series["true_bottom_depth_below_surface"].values))
-            recorded = detect_waveforms(series, self._receiver, self._records, self._seed)
-            self._keep_settings(recorded)
+            recorded = detect_waveforms(series, self._receiver, self._records, self._seed, advice=False)
             self._attributes, self._pixels = dict(recorded.attrs), [str(one) for one in recorded["pixel"].values]
             of_depth = recorded["true_bottom_depth"].values
             found += [(one, recorded.isel(shot=np.flatnonzero(np.isclose(of_depth, one)))) for one in some]
         return [(depth, recorded) for depth, recorded in found if recorded.sizes["shot"]]
 
-    def _keep_settings(self, recorded: xr.Dataset) -> None:
-        """Keep gains and filters that were chosen for the first depths, among them the shallowest."""
-        pixels = recorded["pixel"].values
-        used = (np.broadcast_to(recorded.attrs[name], len(pixels)) for name in ("gain", "optical_density"))
-        numbers = [self._receiver.number_of(str(pixel)) for pixel in pixels]
-        settings = {number: (float(gain), float(other)) for number, gain, other in zip(numbers, *used, strict=True)}
-        self._receiver = self._receiver.with_channel_settings(settings)
+    def _choose_settings(self, depths: FloatArray, deepest: float) -> None:
+        """Choose automatic gains and filters as flights do, by pilot shots over depths of the site [m].
+
+        Those beyond the reach of maps, or below their scene [m], stand there.
+        """
+        lying = np.quantile(depths, (np.arange(PILOTS) + 0.5) / PILOTS)
+        by_maps = bool(lying[0] <= self._reach)
+        bottom = min(deepest, self._reach) if by_maps else float(lying[0])
+        loaded = self._scene_of(bottom, "maps" if by_maps else "merging")
+        pilots = pilots_over(loaded, np.minimum(lying, bottom), bottom, self._seed * 2**20)
+        self._receiver = self._receiver.with_channel_settings(shared_settings(pilots, self._receiver))
+
+    def _scene_of(self, bottom: float, light: str) -> ShotScene:
+        """Return the scene with a bottom at a depth [m]."""
+        if (bottom, light) not in self._scenes:
+            params = {**self._params, "bottom_depth": bottom}
+            options: dict[str, Any] = {"instrument": self._instrument, "light": light, "check": not self._scenes}
+            self._scenes[bottom, light] = ShotScene(self._scene, params, self._places, **options)
+        return self._scenes[bottom, light]
 
     def _by_maps(self, depths: Sequence[float], deepest: float) -> xr.Dataset:
         """Return the light of bottoms at depths up to that of their scene [m], by light maps."""
-        places = self._places
+        places, loaded = self._places, self._scene_of(deepest, "maps")
         if deepest not in self._sea:
-            params = {**self._params, "bottom_depth": deepest}
-            loaded = ShotScene(
-                *(self._scene, params, places), instrument=self._instrument, light="maps", check=not self._sea
-            )
             truth = truth_coordinates(sea_of(loaded.session.scene), loaded.lidar, ShotPoses(places))
-            self._sea[deepest] = loaded, loaded.batches(_PASSES, 1.0, None), truth
-        loaded, batches, truth = self._sea[deepest]
+            self._sea[deepest] = loaded.batches(_PASSES, 1.0, None), truth
+        batches, truth = self._sea[deepest]
         count = len(depths)
         lying = np.tile(depths, len(places))
         poses = ShotPoses(np.repeat(places, count, axis=0), raised=deepest - lying)
-        numbers = self._seed * 2**20 + np.arange(len(poses))
-        parts = [batches.render(poses.part(part), numbers[part].tolist()) for part in batches.parts(len(poses))]
-        attributes = loaded.attributes(used=batches.used_values, passes=_PASSES)
         known = {name: np.repeat(values, count) for name, (_, values, _) in truth.items()}
         below = lying + known["true_surface_height"]
         known |= {"true_bottom_depth": lying, "true_bottom_depth_below_surface": np.where(below > 0, below, np.nan)}
-        series: xr.Dataset = loaded.dataset(ReceivedShots.joined(parts), attributes)
+        series = rendered(loaded, batches, poses, self._seed * 2**20)
         return series.assign_coords({name: ("shot", values) for name, values in known.items()})
 
     def _merged(self, depth: float) -> xr.Dataset:

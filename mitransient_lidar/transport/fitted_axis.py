@@ -77,7 +77,7 @@ def _light_above_water(
     solids = [Solid(_name(shape), _triangles(shape)) for shape in scene.solids]
     found = [
         _lidar_view(scene, transmitter, shift).limits(solids, gates is not None, _is_dry(scene, transmitter, shift))
-        for shift in shifts
+        for shift in dict.fromkeys((float(x), float(y)) for x, y in shifts)
     ]
     first = min(found, key=lambda each: each.first_ns)
     last = max(found, key=lambda each: each.last_ns)

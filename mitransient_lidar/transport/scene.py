@@ -164,9 +164,18 @@ class WaterScene:
     @property
     def has_specular_or_dry_solids(self) -> bool:
         """Whether a solid has a mirror-like part, or rises above the lowest point of the sea."""
+        return self.has_specular_solids or self.has_dry_solids
+
+    @property
+    def has_specular_solids(self) -> bool:
+        """Whether a solid has a mirror-like part."""
+        return self._have_solids(mi.BSDFFlags.DeltaReflection.value | mi.BSDFFlags.DeltaTransmission.value)
+
+    @property
+    def has_dry_solids(self) -> bool:
+        """Whether a solid rises above the lowest point of the sea."""
         lowest, _ = self.sea_heights or (0.0, 0.0)
-        mirror = mi.BSDFFlags.DeltaReflection.value | mi.BSDFFlags.DeltaTransmission.value
-        return self._have_solids(mirror) or any(float(solid.bbox().max.z) > lowest for solid in self.solids)
+        return any(float(solid.bbox().max.z) > lowest for solid in self.solids)
 
     @property
     def has_shared_gaps(self) -> bool:

@@ -25,9 +25,9 @@ from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 
-def lidar_of(params):
-    """Return the lidar of the default scene with other parameters, and the scene, which keeps it alive."""
-    session = open_scene("table1", params)
+def lidar_of(params, scene="table1"):
+    """Return the lidar of a scene with other parameters, and the scene, which keeps it alive."""
+    session = open_scene(scene, params)
     return find_lidar_scene(session.scene, session.sensor), session
 
 
@@ -55,12 +55,14 @@ def test_rays_meet_the_faces_that_the_mesh_has():
         pytest.param({"attenuation": 0.8, "scattering": 0.6, "bottom_depth": 5}, 12, marks=pytest.mark.long),
         pytest.param({"divergence_mrad": 1.5, "field_of_view_mrad": 6}, 24, marks=pytest.mark.long),
         pytest.param({"attenuation": 0.2, "scattering": 0.05, "wind_speed": 6}, 12, marks=pytest.mark.long),
+        # 0.4 m deep, 5.7 m before the water line.
+        pytest.param({"aim_x": -4.3, "divergence_mrad": 2, "field_of_view_mrad": 8, "wind_speed": 5}, 12),
     ],
-    ids=["table1", "waves", "turbid", "narrow", "clear"],
+    ids=["table1", "waves", "turbid", "narrow", "clear", "beach"],
 )
 def test_maps_agree_with_merging(params, passes):
     """Water and bottom of each pixel, within 1 % and their errors; times of bottoms within 0.06 ns and theirs."""
-    lidar, session = lidar_of(params)
+    lidar, session = lidar_of(params, "beach" if "aim_x" in params else "table1")
     merging = session.scene.integrator().prepare(session.scene, session.sensor).by_origin()
     maps = LightMapRenderer(lidar, PathClasses()).by_origin().scaled(8)
 
@@ -113,8 +115,9 @@ def test_series_by_maps_are_rendered_again():
     ],
 )
 def test_what_maps_are_not_for(options, message):
-    with pytest.raises(UserError, match=message):
-        mitransient_lidar.render_shots("table1", **{"positions": [[0, 0]], **options})
+    for render, more in ((mitransient_lidar.render, {}), (mitransient_lidar.render_shots, {"positions": [[0, 0]]})):
+        with pytest.raises(UserError, match=message):
+            render("table1", **more, **options)
 
 
 @pytest.mark.slow
@@ -126,9 +129,43 @@ def test_shots_that_light_a_target_are_merged():
 
 
 @pytest.mark.slow
+def test_vertical_sides_keep_scattered_light():
+    """A cube of 3 m in turbid water, seen at 30 degrees from nadir: without light on its sides it has 0.76 of its own.
+
+    Its sides get less scattered light than they should: 0.93 of the whole.
+    """
+    params = {
+        **{"spectrum": "flat", "layout": "1x1", "off_nadir_deg": 30, "field_of_view_mrad": 60, "aim_x": -2.6},
+        **{"cube_size": 3, "cube_x": 0, "cube_y": 0, "cube_depth": 2, "bottom_depth": 6, "bottom_ripple_height": 0},
+        **{"bottom_slope_x_deg": 0, "bottom_slope_y_deg": 0},
+        **{"attenuation": 0.6, "scattering": 0.45, "backscattering": 0.009},
+    }
+    lidar, session = lidar_of(params, "flight")
+    merging = session.scene.integrator().prepare(session.scene, session.sensor).by_origin()
+    maps = LightMapRenderer(lidar, PathClasses()).by_origin().scaled(8)
+    of_cube = [
+        np.array([renderer.render_pass(seed).histogram.energy()[..., 3, :].sum() for seed in range(8)])
+        for renderer in (maps, merging)
+    ]
+    assert maps.classes.names[3] == "cube"
+    significance.assert_same(*(energy[:, np.newaxis] for energy in of_cube), error=0.03, bias=0.1)
+
+
+@pytest.mark.slow
+def test_shots_over_land_are_merged():
+    """The water line of `beach` is at x = 1.4 m, and 5 cm deep water at 0.7 m; half of the beam is 4 m long."""
+    places = np.array([[-30.0, 0.0], [-6.0, 8.0], [0.0, 0.0], [4.0, 0.0], [30.0, 0.0]])
+    scene = ShotScene("beach", {"divergence_mrad": 2, "field_of_view_mrad": 8}, places, light="maps", check=False)
+    np.testing.assert_array_equal(suits_maps(scene.lidar, ShotPoses(places)), [True, True, False, False, False])
+    with pytest.raises(UserError, match="do not suit the scene: solids reach the surface in 3 shots"):
+        mitransient_lidar.render_shots("beach", positions=places, light="maps")
+
+
+@pytest.mark.slow
 def test_bottoms_of_narrow_beams_have_little_noise_and_state_it():
     """Energies of 64 seeds, two passes each: 12 looks at the bottom for each ray instead of 48 spread by 8.4 %."""
-    places, params = np.zeros((64, 2)), {"wind_speed": 3, "altitude": 600, "jerlov": "1C", "cube_x": 60}
+    params = {"wind_speed": 3, "altitude": 600, "jerlov": "1C", "cube_x": 60, "bottom_ripple_height": 0}
+    places = np.zeros((64, 2))
     given = {"light": "maps", "instrument": "riegl_vq880g2", "components": True, "check": False}
     batches = ShotScene("flight", params, places, **given).batches(2, 1.0, None)
     renderer = batches.at(ShotPoses(places))(2)
@@ -163,6 +200,7 @@ def test_flights_by_maps_find_the_same_bottoms():
     """Depths of both ways to compute the light of 8 pulses differ by their errors, and not by 2 cm in the mean."""
     shipped = FlightPlan.read("semi_arc")
     given = {"scene": "flight", "instrument": "published_airborne", "still_sea": True}
+    given["parameters"] = {"bottom_ripple_height": 0}
     given |= {"platform": shipped.platform, "scanner": shipped.scanner, "pulses": {"rate_hz": 50.0, "most": 8}}
     echoes = {}
     for light in ("merging", "maps"):
@@ -179,3 +217,34 @@ def test_flights_by_maps_find_the_same_bottoms():
     z = ((other - depth) / np.hypot(error, own))[seen]
     assert np.sum(z**2) < 1.5 * significance.largest_chi2(z.size)
     assert abs(np.mean((other - depth)[seen])) < 0.02 + 4 * np.std((other - depth)[seen]) / np.sqrt(z.size)
+
+
+@pytest.mark.slow
+def test_maps_of_images_resolve_fine_waves(monkeypatch):
+    """Water within 3 m of waves from 0.1 m: cells of a shot, 0.2 m wide, focus it more, and finer cells no less."""
+    lidar, _session = lidar_of({"wind_speed": 3, "shortest_wave": 0.1, "cell_size": 0.03, "bin_width_ns": 1})
+    times = lidar.axis.centres_ns - Probe(lidar).echoes.surface_ns.mean()
+    near = (times > 4) & (times <= 28)
+
+    def energy(renderer):
+        shape = lidar.receiver.pixels.count, renderer.classes.count, -1
+        passes = [renderer.render_pass(seed).histogram.energy().reshape(shape)[:, 1, near].sum() for seed in range(6)]
+        return significance.mean_and_error(np.array(passes))
+
+    wide = energy(LightMapRenderer(lidar, PathClasses()).by_origin().scaled(64))
+    own = energy(LightMapRenderer(lidar, PathClasses(), image=True).by_origin())
+    monkeypatch.setattr("mitransient_lidar.transport.light_maps.renderer._CELLS_PER_WAVE", 4)
+    fine = energy(LightMapRenderer(lidar, PathClasses(), image=True).by_origin())
+    assert max(error / mean for mean, error in (wide, own, fine)) < 0.004
+    assert abs(own[0] / fine[0] - 1) < 0.006
+    assert wide[0] > 1.015 * own[0]
+
+
+@pytest.mark.slow
+def test_images_by_maps_are_rendered_again_and_warn_of_shadows(caplog):
+    params = {"layout": "64x64", "gate_count": 10, "gate_width_ns": 4, "target_depth": 9, "bottom_depth": 12}
+    stack = mitransient_lidar.render("gated_mine", params, light="maps", passes=2)
+    assert stack.attrs["light"] == "maps"
+    assert "light = 'maps' leaves out the shadows of target, plate in" in caplog.text
+    again = mitransient_lidar.render(stack)
+    xr.testing.assert_identical(again["gate_energy"], stack["gate_energy"])

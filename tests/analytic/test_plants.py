@@ -25,10 +25,13 @@ def canopy(leaf_width, reflectance, transmittance, **parameters):
     return {"plants": {"type": "canopy", "depth": 3.99, "leaf_width": leaf_width, "bsdf": leaf, **parameters}}
 
 
-def echo(lidar_scene, passes, integrator, count, extra, off_nadir=0.0, water=CLEAR, sea=SMOOTH):
+def echo(lidar_scene, passes, integrator, count, extra, off_nadir=0.0, water=CLEAR, sea=SMOOTH, **paths):
     """Return the light of passes from below the surface of 4 m of water."""
+    photons = {
+        name: number for name, number in paths.items() if integrator == INTEGRATORS[0] or name != "photons_per_pass"
+    }
     scene = lidar_scene(
-        integrator={"type": integrator, "paths_per_pass": 2**14},
+        integrator={"type": integrator, "paths_per_pass": 2**14, **photons},
         tx={"off_nadir_deg": off_nadir},
         rx={"layout": "1x1", "field_of_view_mrad": 30.0, "off_nadir_deg": off_nadir},
         film={"time_start_ns": 1345.0, "bin_width_ns": 1.0, "bin_count": 140},
@@ -60,10 +63,12 @@ def test_light_through_a_leaf_as_wide_as_the_view(lidar_scene, passes, integrato
 )
 def test_direct_echo_passes_the_gaps_once(lidar_scene, passes, integrator, form):
     """exp(-G LAI) of black leaves, not its square: laser and receiver share the gaps."""
-    bare = echo(lidar_scene, passes, integrator, 16, {}).mean()
+    # The plants of a seed vary more than a few paths.
+    few = {"paths_per_pass": 2**13, "photons_per_pass": 2**13}
+    bare = echo(lidar_scene, passes, integrator, 16, {}, **few).mean()
     seeds = range(1 + significance.seed_shift, 13 + significance.seed_shift)
     fields = [canopy(0.1, 0.0, 0.0, size=10.0, form=form, leaf_area_index=1.5, seed=seed) for seed in seeds]
-    ratios = np.array([echo(lidar_scene, passes, integrator, 2, field).mean() for field in fields]) / bare
+    ratios = np.array([echo(lidar_scene, passes, integrator, 2, field, **few).mean() for field in fields]) / bare
     assert_equal(
         ratios, Canopy(1.5, 0.5, 0.1, np.radians(25.0) if form == "blades" else None).gap_probability(0.0), error=0.02
     )
@@ -74,7 +79,9 @@ def test_plants_over_waves_in_turbid_water(lidar_scene, passes):
     water = {"attenuation": 0.3, "scattering": 0.2, "backscattering": 0.006}
     sea = {"spectrum": "elfouhaily", "slope_variance": "cox_munk"}
     plants = canopy(0.05, 0.3, 0.4, size=12.0, form="leaves")
-    found = [echo(lidar_scene, passes, name, 32, plants, 20.0, water, sea) for name in INTEGRATORS]
-    (first, error), (second, other) = map(mean_and_error, found)
-    assert np.hypot(error, other) < 0.01 * second
-    assert abs(first - second) < largest_z(32) * np.hypot(error, other)
+    few = {"photons_per_pass": 2**13}
+    first, second = (echo(lidar_scene, passes, name, 12, plants, 20.0, water, sea, **few) for name in INTEGRATORS)
+    # Both integrators trace the same paths of the receiver for a seed, whose spread of 2.5 % a pass they share.
+    difference, error = mean_and_error((first - second) / second.mean())
+    assert error < 0.0015
+    assert abs(difference) < largest_z(12) * error

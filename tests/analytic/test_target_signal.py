@@ -9,6 +9,8 @@ from mitransient_lidar.studies.target_signal import describe_target, target_map,
 
 NEAR = {"surface_size": 200, "bin_count": 170}
 SMALL = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
+#: For what is refused.
+FEW = {**SMALL, "paths_per_pass": 1024, "photons_per_pass": 1024}
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +93,7 @@ def test_table_lists_pixels_and_combinations(published):
 )
 def test_invalid_input_is_refused(scene, params, options, message):
     with pytest.raises(UserError, match=message):
-        target_signal(scene, {**NEAR, **params}, passes=16, integrator=SMALL, **options)
+        target_signal(scene, {**NEAR, **params}, passes=16, integrator=FEW, **options)
 
 
 @pytest.mark.slow

@@ -5,6 +5,8 @@ from browser_page import BROWSER, DRIVER, Page
 from few_paths import few_paths
 from quick_campaign import QUICK
 
+from mitransient_lidar.campaigns import workers
+from mitransient_lidar.campaigns.shard import Outcome, render_shard
 from mitransient_lidar.plots.gate_viewer.page import page_text
 
 
@@ -55,3 +57,15 @@ def quick(campaign, tmp_path_factory):
 
     run_campaign(campaign, path, workers=1, shard_size=6)
     return path
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Render shards of campaigns and flights here, where imports, kernels and scenes are; other tests use processes."""
+
+    def render(path, shard, retry, *_):
+        found = []
+        render_shard(path, shard, retry, {}, set(), lambda **event: found.append(event), lambda: False)
+        return Outcome(found[-1]["done"], found[-1]["failed"])
+
+    monkeypatch.setattr(workers, "render_in_process", render)

@@ -27,8 +27,8 @@ from mitransient_lidar.core.errors import UserError
 
 
 @pytest.mark.slow
-def test_same_bits_whatever_shards_workers_order_and_interruptions(campaign, quick, tmp_path):
-    """Ctrl-C comes when three runs are done; processes write what they have."""
+def test_same_bits_whatever_shards_workers_order_and_interruptions(campaign, quick, tmp_path, request):
+    """Ctrl-C comes when three runs are done; processes write what they have, and this process renders the others."""
     path, pressed = tmp_path / "other.zarr", []
 
     def press(state):
@@ -41,6 +41,7 @@ def test_same_bits_whatever_shards_workers_order_and_interruptions(campaign, qui
         run_campaign(campaign, path, workers=2, shard_size=5, progress=press)
     signal.signal(signal.SIGINT, former)
     assert np.count_nonzero(Store(path).status() == DONE) >= 3
+    request.getfixturevalue("in_this_process")
     first, other = open_campaign(quick), resume(path, workers=1)
     for name in first.variables:
         np.testing.assert_array_equal(first[name].values, other[name].values, err_msg=str(name))

@@ -10,8 +10,6 @@ from command_line import assert_refused, run
 from oracles import las_reader
 from significance import largest_z
 
-from mitransient_lidar.campaigns import workers
-from mitransient_lidar.campaigns.shard import Outcome, render_shard
 from mitransient_lidar.campaigns.store import DONE, FAILED, Store
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.fly import STORE, fly
@@ -214,7 +212,7 @@ def test_flights_that_cannot_be_rendered(change, message):
 
 
 @pytest.mark.long
-def test_failed_pulses_end_with_exit_code_1(tmp_path, monkeypatch):
+def test_failed_pulses_end_with_exit_code_1(tmp_path, monkeypatch, in_this_process):
     """The other pulses have their points."""
     path, folder, stacked = tmp_path / "short.toml", tmp_path / "failed", FlightRenderer.stacked
     text = TOML.replace("rate_hz = 320.0, most = 32", "rate_hz = 40.0, most = 4")
@@ -225,13 +223,8 @@ def test_failed_pulses_end_with_exit_code_1(tmp_path, monkeypatch):
             raise UserError("the sea is too rough")
         return stacked(renderer, numbers, inputs)
 
-    def render_here(path, shard, retry, report, processes):
-        found = []
-        render_shard(path, shard, retry, {}, set(), lambda **event: found.append(event), lambda: False)
-        return Outcome(found[-1]["done"], found[-1]["failed"])
-
     monkeypatch.setattr(FlightRenderer, "stacked", fails)
-    monkeypatch.setattr(workers, "render_in_process", render_here)
+    monkeypatch.setattr("mitransient_lidar.flights.renderer._BATCH", 2)
     out = run("fly", path, "-o", folder, "--workers", 1, "-q")
     failed = np.count_nonzero(Store(folder / STORE).status() == FAILED)
     assert 0 < failed < 4
@@ -245,6 +238,7 @@ def test_command_refuses_bad_flights(tmp_path):
     for wrong, message in (
         (TOML.replace("rate_hz = 320.0", "rate_hz = -1"), "rate_hz = -1"),
         ('crs = "EPSG:999999"' + TOML, "crs = 'EPSG:999999'"),
+        ("object_class = 44" + TOML, "object_class = 44 must be one of 43, 46, 64"),
     ):
         path.write_text(wrong)
         assert_refused(run("fly", path, "-o", tmp_path / "out"), message)
@@ -252,10 +246,11 @@ def test_command_refuses_bad_flights(tmp_path):
 
 
 @pytest.mark.slow
-def test_weak_surfaces_are_timed_by_the_onset_of_their_column(tmp_path):
+def test_weak_surfaces_are_timed_by_the_onset_of_their_column(tmp_path, in_this_process):
     """Of the shipped `semi_arc`, 20 degrees from nadir: by the level alone errors are 0.12 m, and depths 0.1 m off."""
     plan = tomllib.loads((folder_of_scenes() / "flights" / "semi_arc.toml").read_text("utf-8"))
     plan["pulses"]["most"] = 12
+    plan["parameters"] = {**plan.get("parameters", {}), "bottom_ripple_height": 0}
     plan["seed"] = 1 + significance.seed_shift
     points = fly(plan, tmp_path / "flight", workers=1).load()
     bottoms = points.isel(point=points["kind"] == PointClass.BOTTOM)
@@ -266,7 +261,7 @@ def test_weak_surfaces_are_timed_by_the_onset_of_their_column(tmp_path):
 
 
 @pytest.mark.slow
-def test_infrared_pulses_give_the_surface_of_a_flight(tmp_path):
+def test_infrared_pulses_give_the_surface_of_a_flight(tmp_path, in_this_process):
     """Surfaces of green echoes alone err by 2.0 cm here (root mean square), those of the infrared by 0.5 cm."""
     plan = {
         **FLIGHT,
@@ -293,7 +288,40 @@ def test_infrared_pulses_give_the_surface_of_a_flight(tmp_path):
 
 
 @pytest.mark.slow
-def test_flight_over_a_pier(tmp_path):
+def test_infrared_lines_of_their_own(tmp_path):
+    """Twice as many pulses, straight down, whose points follow those of the green channel with their own numbers."""
+    plan = {
+        **{"scene": "flight", "instrument": "riegl_vq880g2", "still_sea": True, "light": "maps", "target_error": 0.3},
+        "parameters": {"spectrum": "flat", "bottom_ripple_height": 0, "bottom_depth": 2, "cube_x": 99},
+        "platform": {**FLIGHT["platform"], "height": 300.0, "noise": {}},
+        "scanner": {"kind": "fixed", "nadir_angle_deg": 3.0},
+        "pulses": {"rate_hz": 60.0, "most": 3},
+        "infrared_lines": {"scanner": {"kind": "fixed"}, "pulses": {"rate_hz": 120.0, "most": 6}},
+    }
+    points = fly(plan, tmp_path / "flight", workers=1).load()
+    kind, shot, transmitter = (points[name].values for name in ("kind", "shot", "transmitter"))
+    assert shot[transmitter == 1].tolist() == [*range(6)]
+    assert (kind[transmitter == 1] == PointClass.SURFACE).all()
+    assert np.count_nonzero(kind[transmitter == 0] == PointClass.BOTTOM) == 3
+    # Light of the water delays infrared surfaces by at most 4.7 cm.
+    assert np.abs(points["z"].values[transmitter == 1]).max() < 0.04
+    # The level is that of both channels.
+    assert abs(points.attrs["surface_level_m"]) < 0.02
+    lines = describe_points(points)
+    assert lines[lines.index("Infrared channel") + 2].split()[:3] == ["water", "surface", "6"]
+    with laspy.open(tmp_path / "flight" / "points.laz") as file:
+        np.testing.assert_array_equal(file.read()["user_data"], transmitter)
+    waveforms = laspy.read(tmp_path / "flight" / "waveforms.las")
+    assert len(waveforms.points) == np.count_nonzero(transmitter == 0)
+    assert read_points(tmp_path / "flight").sizes == points.sizes
+    with pytest.raises(UserError, match=r"infrared = true and \[infrared_lines\] are alternatives"):
+        FlightPlan.of_file({**plan, "infrared": True})
+    with pytest.raises(UserError, match="has no infrared channel"):
+        FlightPlan.of_file({**plan, "instrument": "riegl_vq840g"})
+
+
+@pytest.mark.slow
+def test_flight_over_a_pier(tmp_path, in_this_process):
     """Its top is ground, its edge an object above the water, and sea and bottom lie beside it."""
     plan = {
         **{

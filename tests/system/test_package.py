@@ -16,8 +16,10 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     source = tmp_path_factory.mktemp("source") / "project"
-    # A clean copy: a build folder of an earlier wheel would hide what the configuration forgets.
-    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".*", "build", "dist", "site", "*.egg-info", "*.nc"))
+    # A clean copy: a build folder of an earlier wheel would hide what the configuration forgets. The site may be built
+    # meanwhile.
+    others = ".*", "build", "dist", "docs", "site", "*.egg-info", "*.nc"
+    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(*others))
     for path in (ROOT / "scenes" / "instruments").glob("*.nc"):
         shutil.copy(path, source / "scenes" / "instruments")
     (source / "mitransient_lidar" / "commit.txt").write_text("0123456789ab\n")

@@ -54,7 +54,7 @@ def write_sbet(path):
     record.astype("<f8").tofile(path)
 
 
-def test_points_lie_where_map_and_trajectory_have_them(tmp_path):
+def test_points_lie_where_map_and_trajectory_have_them(tmp_path, in_this_process):
     """The signal is clipped: flags and errors of saturated echoes are seen, and the bottom is found all the same.
 
     A map about its centre, the usual one, would be half a cell off at the step, and wrong by 2 m beside it.

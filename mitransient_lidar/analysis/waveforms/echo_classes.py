@@ -34,7 +34,7 @@ IN_AIR = 0.5e-9 * C0
 _FAR = 4.0  # standard deviations of the surface's time beyond which an echo before others stands above the water
 _APART = 1.2  # least separation of two echoes of which the first one stands above the water, in echo widths
 _WEAK, _FAR_APART = 15.0, 8.0  # height of a weak first echo over the noise, and farthest others behind it, in widths
-_SURE, _OVER_BOTTOM = 0.5, 0.9  # least one of a surface without a column, and where it may rather be a bottom
+_OVER_BOTTOM = 0.9  # least probability of a surface without a column that may rather be a bottom than land
 _TWICE, _SECOND = 0.1, 5.0  # of a peak, light that meets the bottom twice, and its farthest distance in echo widths
 # Its delays over those of the bottom, and its largest height times delay over width.
 _RETURNS, _BRIGHTEST = (2.2, 3.2), 0.5
@@ -130,9 +130,9 @@ def decide(
     An echo that is more than 4 standard deviations before the surface's level, and 1.2 echo widths before others, is an
     object above the water. First echoes without others, or with others nearer than 1.8 echo widths, are those of
     `first_echoes.first_echoes`, unless they are at the surface's level and a column follows them. A surface without a
-    column needs a probability of 50 %, or of 90 % where it is a bottom rather than land. In the near infrared, where
-    column and bottom are part of the surface's echo, a first echo is land or the surface, and nothing follows the
-    surface.
+    column is likelier than land, or has a probability of 90 % where it is a bottom rather than land. In the near
+    infrared, where column and bottom are part of the surface's echo, a first echo is land or the surface, and nothing
+    follows the surface.
 
     Of 150 drawn records each (VQ-880-G II at nadir and 600 m, a level known to 0.15 m, glints from none to five times
     the bottom's echo, reflectances 0.05 to 0.4), all land from 0.2 to 4 m is land, and 99 % of the bottoms from 0.3 to
@@ -238,6 +238,7 @@ def decide(
         decay,
         waveforms.onset,
         opaque,
+        waveforms.baseline_stderr[(part.start + tested) % waveforms.baseline.size],
     )
     pulse, shape = waveforms.blurred_pulse, waveforms.echo_shape
     # The strongest of the first two.
@@ -248,7 +249,7 @@ def decide(
     first = first_echoes(records.part(tested), peak, pulse, shape, width, priors, extent)
     probability[tested] = first.chance.max(axis=0)
     land, sea, bottom = first.chance
-    decided = sea < np.where(bottom > land, _OVER_BOTTOM, _SURE)
+    decided = sea < np.where(bottom > land, _OVER_BOTTOM, land)
     return _decided(Decision(found, above, probability, tested[decided], first.part(decided)), records, shape, width)
 
 

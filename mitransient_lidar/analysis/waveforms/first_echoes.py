@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
 from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset
-from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, Echoes, IntArray, Records
+from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, Echoes, IntArray, Records, error_of_sums
 from mitransient_lidar.analysis.waveforms.echo_fits import Limits, Model, WindowFits, Windows, fit_windows
 from mitransient_lidar.analysis.waveforms.echo_shape import BlurredPulse, EchoShape
 from mitransient_lidar.analysis.waveforms.surface_times import SurfaceLevel
@@ -30,9 +30,13 @@ _AT_ONCE = 2**17  # samples that are fitted at once, for speed
 _BOTH = 0.3  # delay from which the peak may be that of the surface or of the bottom, in echo widths
 # Prior distributions: heights of land and depths of bottoms that are as likely as each other [m], and shares.
 _HIGHEST, _DEEPEST, _OF_LAND, _WITHOUT_BOTTOM = 20.0, 10.0, 0.5, 0.3
-_LEAST_COLUMN = 1e-5  # of a column of unknown water, relative to the peak
+# Of a column of unknown water, relative to the peak, and the highest level of a column over that of the clearest water.
+_LEAST_COLUMN, _MOST_COLUMN = 1e-5, 150.0
 _FARTHEST_DECAY = 2.3  # largest logarithm of a column's decay over the typical one
 _LEVELS, _CLEAR = 64, 3.0  # tried levels of a column, and standard errors from which on its fit alone counts
+# Runs of samples behind those of the fits: their number and length [ns], decays that are tried, and the error of the
+# pulse's tail there over the peak, where the sensitivity of the receiver is known and where it is not.
+_RUNS, _RUN_NS, _DECAYS, _OF_TAIL = 8, 20.0, 9, (2e-5, 1e-3)
 _SIGNIFICANT = 5.0  # standard errors of the height of a surface that is told apart
 _LEAST_SPREAD = 0.02  # standard deviation of a surface's time [ns]
 # Light that a bottom sends back to itself by total reflection at the surface: times over those of the depth between
@@ -89,6 +93,8 @@ class Priors:
         Mean focusing of the column's light by waves.
     opaque
         Whether light of column and bottom is part of the surface's echo.
+    baseline_stderr
+        Standard error of weak steady signals above the level without light [unit of the record], shape (n,).
     """
 
     level: SurfaceLevel
@@ -98,6 +104,7 @@ class Priors:
     decay: float
     onset: ColumnOnset
     opaque: bool
+    baseline_stderr: FloatArray
 
     def column(self, delay_ns: FloatArray, decay: FloatArray | float) -> tuple[FloatArray, FloatArray]:
         """Return the signal of a column at delays from the surface, over that at the surface, and its derivative."""
@@ -145,8 +152,10 @@ def first_echoes(
     The probabilities are those of Bayes' theorem with these prior distributions: land and water are as likely; heights
     of land are uniform up to 20 m above the surface, depths of bottoms up to 10 m; the surface has the normal
     distribution of its level; three waters in ten show no bottom; decays of columns are uniform up to ten times the
-    typical one, and logarithms of their levels from that of the clearest water to the peak. Land is thus what stands
-    above the surface, or what has no column where even the clearest water would show one. The echoes of surface and
+    typical one, and logarithms of their levels from that of the clearest water to 150 times as much, or to the peak.
+    Land is thus what stands above the surface, or what has no column where even the clearest water would show one. The
+    next 160 ns behind the samples of the fits count, too: they tell a surface from land, but not from a bottom. A
+    column that a digitiser rounds to nothing does not tell them. The echoes of surface and
     column beside a bottom cost the volume of their parameters (Laplace's approximation). Depths are means over 32
     delays d up to that at which the surface is 4 standard deviations above its level, or from the fit of all
     parameters where the surface has an echo of its own; errors include the spread of these delays and their spacing.
@@ -173,13 +182,15 @@ def first_echoes(
     sea = fits.surface()
     log_sea = np.log((1 - _OF_LAND) * _WITHOUT_BOTTOM) - 0.5 * sea.cost
     log_sea += _log_normal(arrival + sea.values[:, 0], level.time_ns, spread)
-    log_sea += _log_column(sea, priors.least_column, fits.peak)
-    log_sea += _log_decay(sea, 4)
+    column, with_late = _log_column(sea, records, land_ns, fits)
+    log_sea += with_late + _log_decay(sea, 4)
 
     tried = fits.bottoms(delays)
     bottom_ns = arrival + np.stack([one.values[:, 0] for one in tried])
     surface_ns = bottom_ns - delays
     prior = np.log((1 - _OF_LAND) * (1 - _WITHOUT_BOTTOM) * priors.depth_per_ns / _DEEPEST)
+    # Light that follows long behind a bottom is scattered, too.
+    prior += np.maximum(with_late - column, 0)
     posterior = prior + _log_normal(surface_ns, level.time_ns, spread)
     posterior += np.stack([-0.5 * one.cost - _occam(one) for one in tried])
     steps = np.gradient(np.concatenate([zero[np.newaxis], delays]), axis=0)[1:]
@@ -409,17 +420,62 @@ def _log_normal(time: FloatArray, middle: FloatArray, spread: FloatArray) -> Flo
     return np.asarray(-0.5 * ((time - middle) / spread) ** 2 - np.log(spread * np.sqrt(2 * np.pi)))
 
 
-def _log_column(fit: WindowFits, least: FloatArray, peak: FloatArray) -> FloatArray:
-    """Return the logarithm of the mean likelihood of a column over its prior levels, relative to the fitted one."""
+def _late_light(records: Records, first_ns: FloatArray, fits: _Fits) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return probabilities of decays, and what samples behind those of fits state of the levels of columns.
+
+    The logarithm of the likelihood of a level L over that of no light is L a - L^2 b/2.
+
+    Parameters
+    ----------
+    records, first_ns, fits
+        Waveforms, arrivals of their first echoes [ns], shape (n,), and their fits.
+
+    Returns
+    -------
+    ndarray
+        Probabilities of decays, shape (decays, 1), and a and b, shape (decays, n).
+    """
+    priors = fits.priors
+    noise = np.broadcast_to(records.noise, records.power.shape)
+    delay = records.time_ns - first_ns[:, np.newaxis]
+    # Rounding hides the same part of all runs, which together count as one.
+    floor = np.where(priors.least_column > 0, *_OF_TAIL) * fits.peak
+    floor = np.hypot(floor, math.sqrt(_RUNS) * priors.baseline_stderr)
+    q = np.linspace(-_FARTHEST_DECAY, _FARTHEST_DECAY, _DECAYS)[:, np.newaxis]
+    chance = np.exp(-0.5 * (q / OF_DECAY) ** 2)
+    linear, square = (np.zeros((_DECAYS, len(first_ns))) for _ in range(2))
+    for start in float(fits.data.u[-1]) + records.bin_ns + _RUN_NS * np.arange(_RUNS):
+        inside = (delay >= start) & (delay < start + _RUN_NS)
+        number = np.maximum(inside.sum(axis=1), 1)
+        mean = np.sum(np.where(inside, records.power, 0.0), axis=1) / number
+        error = np.hypot(error_of_sums(np.where(inside, noise, 0.0), None, records.shared) / number, floor)
+        weight = np.where(inside.any(axis=1), 1 / np.maximum(error, 1e-300) ** 2, 0.0)
+        column, _ = priors.column(np.full(len(mean), start + 0.5 * _RUN_NS), priors.decay * np.exp(q))
+        linear, square = linear + weight * column * mean, square + weight * column**2
+    return chance / chance.sum(), linear, square
+
+
+def _log_column(fit: WindowFits, records: Records, first_ns: FloatArray, fits: _Fits) -> tuple[FloatArray, FloatArray]:
+    """Return the logarithm of the mean likelihood of a column over its prior levels, relative to the fitted one.
+
+    First without light behind the samples of the fits, and then with it, over that of no such light.
+    """
+    priors, peak = fits.priors, fits.peak
     error, found = np.where(_error(fit, 3) > 0, _error(fit, 3), peak), fit.values[:, 3]
-    low = np.maximum(np.maximum(least, _LEAST_COLUMN * peak), 1e-300)
-    decades = np.log(np.maximum(peak / low, 10.0))
+    chance, linear, square = _late_light(records, first_ns, fits)
+    error = np.hypot(error, priors.baseline_stderr)
+    low = np.maximum(np.maximum(priors.least_column, _LEAST_COLUMN * peak), 1e-300)
+    high = np.where(priors.least_column > 0, np.minimum(_MOST_COLUMN * low, peak), peak)
+    decades = np.log(np.maximum(high / low, 10.0))
     levels = low * np.exp(decades * np.linspace(0, 1, _LEVELS)[:, np.newaxis])
-    coarse = logsumexp(-0.5 * np.minimum(np.abs(levels - found) / error, 1e6) ** 2, axis=0) - np.log(_LEVELS)
     # Where no level is within the error of a distinct one, the integral of its normal distribution.
     clear = (found > _CLEAR * error) & (found > low)
     sharp = np.log(np.sqrt(2 * np.pi) * error / np.where(clear, found, 1.0) / decades)
-    return np.asarray(np.where(clear, sharp, coarse), dtype=np.float64)
+    logs = -0.5 * np.minimum(np.abs(levels - found) / error, 1e6) ** 2
+    level = levels[:, np.newaxis]
+    late = logsumexp(level * linear - 0.5 * level**2 * square, axis=1, b=chance)
+    near, both = (np.where(clear, sharp, logsumexp(one, axis=0) - np.log(_LEVELS)) for one in (logs, logs + late))
+    return np.asarray(near), np.asarray(both)
 
 
 def _mean(weight: FloatArray, times: FloatArray, errors: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -16,6 +16,7 @@ from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Fadin
 from mitransient_lidar.analysis.waveforms.depth_errors import HEIGHTS, column_gain
 from mitransient_lidar.analysis.waveforms.echo_detection import Records
 from mitransient_lidar.analysis.waveforms.echo_shape import BlurredPulse, EchoShape, Response, Template
+from mitransient_lidar.analysis.waveforms.saturation import level_error
 from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, LEVEL, SurfaceLevel
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
@@ -53,6 +54,8 @@ class Waveforms:
     baseline, noise
         Level of each pixel without light, shape (pixels,), and standard deviation of its samples, shape (pixels, time)
         or (pixels, 1), or of each waveform where it differs between shots, shape (count, time).
+    baseline_stderr
+        Standard error of weak steady signals above this level, by the level and by rounding, shape (pixels,).
     saturated, saturation_level
         Samples at a limit, of the shape of `samples`, and the least such sample.
     kernel, template, echo_shape
@@ -85,6 +88,7 @@ class Waveforms:
     time_ns: FloatArray
     baseline: FloatArray
     noise: FloatArray
+    baseline_stderr: FloatArray
     saturated: npt.NDArray[np.bool_] | None
     saturation_level: float
     kernel: tuple[int, FloatArray]
@@ -160,7 +164,8 @@ class Waveforms:
         quiet, calm = time < quiet_until, samples
         if name == "signal" and not in_blocks:
             quiet, calm = _without_land(samples, time, quiet_until, events, width)
-        baseline = np.zeros(pixels)
+        run = max(int(template.fwhm_ns / step), 1)
+        baseline = baseline_error = np.zeros(pixels)
         if in_blocks:
             baseline, _ = _block_levels(dataset, pixels)
         elif name == "signal":
@@ -168,8 +173,10 @@ class Waveforms:
                 raise UserError(
                     f"the record must hold at least {_FEWEST_QUIET} bins before {quiet_until:.1f} ns for its baseline"
                 )
-            baseline = calm[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)).mean(axis=(0, 2))
-        run = max(int(template.fwhm_ns / step), 1)
+            dark = calm[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet))
+            baseline = dark.mean(axis=(0, 2))
+            rest = dark - baseline[:, np.newaxis]
+            baseline_error = level_error(rest, _inflation(rest, run), samples[: _MOST_SHOTS * pixels])
         deviation, shared = _noise(dataset, name, samples, calm, baseline, quiet, noise, run), None
         if name == "waveform" and noise is None and "waveform_stderr" in dataset:
             deviation, shared = _noise_of_render(dataset, deviation, run)
@@ -183,6 +190,7 @@ class Waveforms:
             time,
             baseline,
             deviation,
+            baseline_error,
             dataset["saturated"].values.reshape(-1, time.size).astype(bool) if "saturated" in dataset else None,
             math.inf if saturation_level is None else float(saturation_level),
             kernel,

@@ -1,8 +1,11 @@
-"""Clipped samples: how long they last about echoes, and which echoes may be light that a bottom has returned twice."""
+"""Limits of samples: how long they are clipped about echoes, which of these meet a bottom twice, and their steps."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import numpy.typing as npt
 
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, IntArray
 from mitransient_lidar.core.validation import FloatArray
@@ -68,3 +71,29 @@ def may_be_second_return(
     start, end = clipped_ns.T[..., np.newaxis, np.newaxis]
     clipped = (start <= time_ns - half_ns) & (time_ns - half_ns <= end) & (half_ns > 2 * width_ns)
     return np.asarray(clipped & (np.arange(time_ns.shape[-1]) > 1))
+
+
+def level_error(rest: FloatArray, inflation: float, samples: npt.NDArray[np.floating]) -> FloatArray:
+    """Return the standard error of weak steady signals above the level without light, shape (pixels,).
+
+    Parameters
+    ----------
+    rest
+        Samples without light less this level, shape (shots, pixels, bins).
+    inflation
+        Standard deviation of means of neighbouring samples over that of independent ones.
+    samples
+        Samples with light, whose least difference is the step of the digitiser.
+
+    Notes
+    -----
+    Noise of a standard deviation s spreads a level over steps h of a digitiser: the mean deviates by rounding by
+    h/pi exp(-2 pi^2 s^2/h^2) at most (B. Widrow, I. Kollar, M.-C. Liu, IEEE Trans. Instrum. Meas. 45, 353 (1996)).
+    Without noise, each of signal and level is uniformly distributed over a step.
+    """
+    steps = np.diff(np.unique(samples))
+    step = float(steps.min()) if steps.size else 0.0
+    scatter = np.asarray(rest.std(axis=(0, 2)), dtype=np.float64)
+    noise = np.maximum(scatter**2 - (step * _OF_UNIFORM) ** 2, 0)
+    rounding = math.sqrt(2) * _OF_UNIFORM * step * np.exp(-2 * (math.pi / step) ** 2 * noise) if step > 0 else 0.0
+    return np.hypot(inflation * scatter / math.sqrt(rest[:, 0].size), rounding)

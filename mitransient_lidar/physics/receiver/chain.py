@@ -231,6 +231,19 @@ class ReceiverChain:
                 light, sky = light[strongest], sky[strongest]
         return factor
 
+    def without_brightest(
+        self, power: FloatArray, bin_width_ns: float, background: FloatArray, count: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return powers, shape (shots, ..., time), and backgrounds, shape (shots, ...), without the brightest shots.
+
+        These are the `count` shots whose records have the highest voltages.
+        """
+        if count == 0 or self.amplifier is None:
+            return power, background
+        highest = self._highest(power, bin_width_ns, background).reshape(len(power), -1).max(axis=1)
+        kept = np.sort(np.argsort(highest, kind="stable")[: len(power) - count])
+        return power[kept], background[kept]
+
     def fitting_attenuation(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> float:
         """Return the least factor, at least 1, by which light must be attenuated for samples in range.
 

@@ -20,7 +20,13 @@ from mitransient_lidar.rendering.accumulators import Light
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
 from mitransient_lidar.transport.light_maps.maps import HeightFields
-from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer, light_faintly
+from mitransient_lidar.transport.light_maps.renderer import (
+    REACH_THE_SURFACE,
+    LightMapRenderer,
+    UnsuitedError,
+    light_faintly,
+    over_water,
+)
 from mitransient_lidar.transport.medium.bubbles import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
@@ -67,6 +73,9 @@ class ShotPoses:
     times_s: FloatArray | None = None
     #: Heights by which shots meet the solids raised [m], shape (shots,), over light maps; None for no height.
     raised: FloatArray | None = None
+    #: Places of the sea that shots meet instead of the waves at their own [m], and their turns there, as `turns`, both
+    #: of shape (shots, 2); None for their own.
+    other_sea: tuple[FloatArray, FloatArray] | None = None
 
     @classmethod
     def of_receiver(cls, lidar: LidarScene, receiver: Pose) -> ShotPoses:
@@ -100,7 +109,13 @@ class ShotPoses:
         in_scene = None if self.in_scene is None else self.in_scene.part(rows)
         times_s = None if self.times_s is None else self.times_s[rows]
         raised = None if self.raised is None else self.raised[rows]
-        return ShotPoses(self.places[rows], turns, receiver, transmitter, in_scene, times_s, raised)
+        other_sea = None if self.other_sea is None else (self.other_sea[0][rows], self.other_sea[1][rows])
+        return ShotPoses(self.places[rows], turns, receiver, transmitter, in_scene, times_s, raised, other_sea)
+
+    @property
+    def on_sea(self) -> ShotPoses:
+        """The shots as they meet the sea."""
+        return self if self.other_sea is None else replace(self, places=self.other_sea[0], turns=self.other_sea[1])
 
     def repeated(self, copies: int) -> ShotPoses:
         """Return each shot several times in turn."""
@@ -262,12 +277,13 @@ class ShotBatches:
         """Return a function that returns the renderer of shots, each several times."""
         if isinstance(self._renderer, LightMapRenderer):
             return self._over_maps(self._renderer, shots)
-        parts: list[tuple[mi.Scene, FloatArray | None]] = [] if self._going is None else [(self._going, None)]
+        parts: list[tuple[mi.Scene, FloatArray | None, bool]] = []
+        parts += [] if self._going is None else [(self._going, None, False)]
         for sea in self._seas:
-            positions = sea.move(shots.places, shots.times_s)
-            parts.append((sea.shapes, positions))
+            positions = sea.move(shots.on_sea.places, shots.times_s)
+            parts.append((sea.shapes, positions, True))
         places = shots.places - self._frame_origin
-        parts += [] if self._fixed is None else [(self._fixed, places)]
+        parts += [] if self._fixed is None else [(self._fixed, places, False)]
         lidar = self._renderer.scene
         water = shots.water(lidar.water, places[0], self._aim)
         surfaces = [*lidar.surfaces, *(sea.shape for sea in self._seas)]
@@ -275,10 +291,10 @@ class ShotBatches:
         def scene_of(copies: int) -> LidarScene:
             all_shots = shots.repeated(copies)
             moved = tuple(
-                all_shots.scene_part(
+                (all_shots.on_sea if is_sea else all_shots).scene_part(
                     shapes, None if positions is None else np.repeat(positions, copies, axis=0), self._aim
                 )
-                for shapes, positions in parts
+                for shapes, positions, is_sea in parts
             )
             receiver, transmitter = all_shots.receiver, all_shots.transmitter
             placed = replace(lidar, parts=moved, surfaces=surfaces, water=water)
@@ -296,20 +312,19 @@ class ShotBatches:
 
         def renderer_of(copies: int) -> PassRenderer:
             all_shots = shots.repeated(copies)
-            moved, waves = (
-                [
-                    all_shots.scene_part(scene, None if at is None else np.repeat(at, copies, axis=0), self._aim)
-                    for scene, at in some
-                ]
-                for some in (parts, [(lidar.mitsuba_scene, shots.places)])
-            )
+            moved = [
+                all_shots.scene_part(scene, None if at is None else np.repeat(at, copies, axis=0), self._aim)
+                for scene, at in parts
+            ]
+            on_sea = all_shots.on_sea
+            waves = on_sea.scene_part(lidar.mitsuba_scene, on_sea.places, self._aim)
             placed = replace(
                 lidar,
                 parts=tuple(moved),
                 receiver_poses=all_shots.receiver,
                 transmitter_poses=all_shots.transmitter,
             )
-            fields = HeightFields.of_patches(heights, corners, sea.cell_size, sea.wind_direction, waves[0], copies)
+            fields = HeightFields.of_patches(heights, corners, sea.cell_size, sea.wind_direction, waves, copies)
             return renderer.over(placed, fields)
 
         return renderer_of
@@ -317,9 +332,9 @@ class ShotBatches:
     def _heights(self, sea: SeaPatches, shots: ShotPoses) -> tuple[FloatArray, FloatArray]:
         """Return the heights of the sea about shots, as of `SeaPatches.heights`, once where only solids differ."""
         if shots.raised is None:
-            whole: tuple[FloatArray, FloatArray] = sea.heights(shots.places, shots.times_s)
+            whole: tuple[FloatArray, FloatArray] = sea.heights(shots.on_sea.places, shots.times_s)
             return whole
-        wanted = [tuple(place) for place in shots.places.tolist()]
+        wanted = [tuple(place) for place in shots.on_sea.places.tolist()]
         for place in {*wanted} - self._known.keys():
             self._known[place] = sea.heights(np.array([place]))
         heights, corners = zip(*(self._known[place] for place in wanted), strict=True)
@@ -398,10 +413,17 @@ def _errors(window: ErrorWindow | None, light: Light) -> FloatArray:
 
 
 def suits_maps(lidar: LidarScene, poses: ShotPoses) -> BoolArray:
-    """Return which shots of a scene that suits light maps light its targets so faintly that maps serve them."""
+    """Return which shots of a scene that suits light maps serve: over water, with faint light on targets."""
     places = poses.places - lidar.frame_origin[:2]
     faint = [light_faintly(lidar, target, places, poses.turns) for target in lidar.targets]
-    return np.all(faint, axis=0) if faint else np.ones(len(poses), dtype=bool)
+    return np.asarray(np.all([over_water(lidar, places, poses.turns), *faint], axis=0))
+
+
+def require_water(lidar: LidarScene, poses: ShotPoses) -> None:
+    """Raise `UnsuitedError` if light maps do not suit shots, since they meet land, or solids near the surface."""
+    dry = ~over_water(lidar, poses.places - lidar.frame_origin[:2], poses.turns)
+    if dry.any():
+        raise UnsuitedError(f"light maps do not suit the scene: {REACH_THE_SURFACE} in {np.count_nonzero(dry)} shots")
 
 
 def share_for_error(error: float) -> float:

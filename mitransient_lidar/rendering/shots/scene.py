@@ -69,7 +69,7 @@ class ShotScene:
     ) -> None:
         variants.leave_the_gpu("shots are rendered")
         self._open = functools.partial(open_scene, scene, instrument=instrument, sensor=sensor)
-        self._params, self._target = params, target
+        self._params, self._target, self.light = params, target, light
         self._place = float(places[0, 0]), float(places[0, 1])
         self.session = self._open(self._at(*self._place))
         loaded = self.session.scene, self.session.sensor

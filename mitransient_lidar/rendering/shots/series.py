@@ -23,7 +23,6 @@ from mitransient_lidar.core.options import (
     SceneOrResult,
     Sensor,
     checked,
-    one_of,
     positive_option,
 )
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
@@ -37,7 +36,6 @@ from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import (
-    LIGHT,
     Components,
     LightOption,
     Progress,
@@ -49,6 +47,7 @@ from mitransient_lidar.rendering.shots.batches import (
     MOST_PASSES_FOR_ERROR,
     ReceivedShots,
     ShotPoses,
+    require_water,
     share_for_error,
     suits_maps,
 )
@@ -198,11 +197,11 @@ def render_shots(
         options_given |= {"params": other, "instrument": channel, "axis": None}
         options_given["positions"] = np.column_stack([green[name] for name in AIM])
         return join(green, render_shots(**options_given))
-    options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
+    differentiated = [*derivatives] if derivatives else None
+    options = RenderOptions(
+        target_error=target_error, max_time=max_time, pass_share=pass_share, derivatives=differentiated, light=light
+    )
     wanted = options.target_error
-    one_of("light", light, LIGHT)
-    if light == "maps" and derivatives:
-        raise UserError("light = 'maps' has no derivatives: use light = 'merging'")
     usual = (8, 1.0) if wanted is None else (MOST_PASSES_FOR_ERROR, share_for_error(wanted))
     if light == "maps":
         usual = 2 if wanted is None else MOST_PASSES_FOR_ERROR, 1.0
@@ -221,6 +220,8 @@ def render_shots(
     channels: dict[str, Any] = {"components": bool(components), "derivatives": derivatives or (), "light": light}
     try:
         series = ShotScene(scene, params, places, **source, target=target, axis=axis, **channels)
+        if light == "maps" and not merge_unsuited:
+            require_water(series.lidar, ShotPoses(places))
         suits = light == "merging" or not merge_unsuited or bool(suits_maps(series.lidar, ShotPoses(places)).all())
     except UnsuitedError:
         suits = False

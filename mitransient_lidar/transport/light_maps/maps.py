@@ -124,14 +124,18 @@ class HeightFields:
         return at, mi.Vector2f(along, across) * self.per_metre
 
 
-#: Cells on each side of a map, and its half width over the standard deviation of the beam.
-_CELLS, _SPREADS = 48, 4.0
+#: Half width of a map over the standard deviation of the beam.
+_SPREADS = 4.0
 
 #: Half width of a map for refraction by waves, over the depth.
 _WIDTH_PER_DEPTH = 0.15
 
-#: Units of energy [1 over that emitted], and of energy times length [1/m], in the integer sums of a map.
-_ENERGY_UNITS, _LENGTH_UNITS = 2.0**26, 2.0**24
+#: Units of energy [1 over that emitted] in the integer sums of a map for each ray, and the limits of their number; over
+#: them the units of energy times length [1/m].
+_UNITS_PER_RAY, _FEWEST_UNITS, _MOST_UNITS, _LENGTH_UNITS = 2**16, 2**26, 2**30, 0.25
+
+#: Cells on each side of a map with the fewest rays.
+FEWEST_CELLS = 48
 
 
 @dataclass(frozen=True)
@@ -143,10 +147,11 @@ class Planes:
     #: Optical depths of absorption and scattering along the receiver's axis [1].
     absorbed: FloatArray
     scattered: FloatArray
+    cells: int = FEWEST_CELLS  #: Cells on each side of the maps.
 
     @classmethod
     def of_scene(cls, scene: LidarScene, deepest: float, count: int) -> Planes:
-        """Return planes down to a depth [m]."""
+        """Return planes down to a depth [m], with the fewest cells."""
         depths, pose = np.linspace(0, deepest, count), scene.receiver.pose
         slant = -float(pose.axis[2])
         spread = scene.transmitter.widest_angular_spread * pose.ground_range / slant
@@ -158,7 +163,7 @@ class Planes:
 
     def cell(self, depth: FloatArray) -> FloatArray:
         """Return the side of cells at depths [m]."""
-        return np.asarray(2 / _CELLS * np.interp(depth, self.depths, self.half))
+        return np.asarray(2 / self.cells * np.interp(depth, self.depths, self.half))
 
 
 class LightMaps:
@@ -167,11 +172,12 @@ class LightMaps:
     Cells are counted from where the transmitter's axis, refracted by a level sea, meets the plane. Energies are kept
     relative to the absorption along the receiver's axis, with and without those that scattering turns.
 
-    `scene`: scene of one or several shots.
+    `scene`: scene of one or several shots. `rays`: number of rays of each beam.
     """
 
-    def __init__(self, scene: LidarScene, planes: Planes, shots: int) -> None:
-        self.count = planes.depths.size
+    def __init__(self, scene: LidarScene, planes: Planes, shots: int, rays: int) -> None:
+        self.count, self._cells = planes.depths.size, planes.cells
+        self._units = float(np.clip(_UNITS_PER_RAY * rays, _FEWEST_UNITS, _MOST_UNITS))
         self._step = opaque(float(planes.depths[1]))
         self._half, self._absorbed, self._scattered = (
             aligned(mi.Float, each.astype(np.float32)) for each in (planes.half, planes.absorbed, planes.scattered)
@@ -191,7 +197,7 @@ class LightMaps:
         to_entry = np.linalg.norm(entries - origins, axis=1) - ranges
         self._to_entry = aligned(mi.Float, to_entry.astype(np.float32))
         self._per_depth = aligned(mi.Float, (scene.group_index / -below[:, 2]).astype(np.float32))
-        size = shots * self.count * _CELLS**2
+        size = shots * self.count * self._cells**2
         self._energy, self._clear = (dr.zeros(mi.UInt32, size) for _ in range(2))
         self._length = dr.zeros(mi.Int32, size)
 
@@ -210,15 +216,16 @@ class LightMaps:
 
         The place is seen from the axis at its depth.
         """
-        beside = mi.Vector2f(place.x, place.y) - lanes.pick(self._entry) - lanes.pick(self._tilt) * depth
-        per_metre = 0.5 * _CELLS / dr.gather(mi.Float, self._half, plane)
-        i, j = beside.x * per_metre + 0.5 * _CELLS, beside.y * per_metre + 0.5 * _CELLS
-        inside = (i >= 0) & (j >= 0) & (i < _CELLS) & (j < _CELLS)
-        cell = mi.UInt32(dr.select(inside, j, 0)) * _CELLS + mi.UInt32(dr.select(inside, i, 0))
+        beside, cells = mi.Vector2f(place.x, place.y) - lanes.pick(self._entry), self._cells
+        beside -= lanes.pick(self._tilt) * depth
+        per_metre = 0.5 * cells / dr.gather(mi.Float, self._half, plane)
+        i, j = beside.x * per_metre + 0.5 * cells, beside.y * per_metre + 0.5 * cells
+        inside = (i >= 0) & (j >= 0) & (i < cells) & (j < cells)
+        cell = mi.UInt32(dr.select(inside, j, 0)) * cells + mi.UInt32(dr.select(inside, i, 0))
         level = (
             lanes.pick(self._to_entry) + lanes.pick(self._per_depth) * depth + dr.dot(beside, lanes.pick(self._later))
         )
-        return (lanes.shot * self.count + plane) * _CELLS**2 + cell, inside, level
+        return (lanes.shot * self.count + plane) * cells**2 + cell, inside, level
 
     def add(
         self,
@@ -251,9 +258,9 @@ class LightMaps:
         kept = energy * dr.exp(absorbed)
         clear = kept * dr.exp(scattered)
         active &= inside
-        dr.scatter_add(self._energy, mi.UInt32(kept * _ENERGY_UNITS), cell, active)
-        dr.scatter_add(self._clear, mi.UInt32(clear * _ENERGY_UNITS), cell, active)
-        dr.scatter_add(self._length, mi.Int32(clear * (length - level) * _LENGTH_UNITS), cell, active)
+        dr.scatter_add(self._energy, mi.UInt32(kept * self._units), cell, active)
+        dr.scatter_add(self._clear, mi.UInt32(clear * self._units), cell, active)
+        dr.scatter_add(self._length, mi.Int32(clear * (length - level) * (_LENGTH_UNITS * self._units)), cell, active)
 
     def look_up(
         self, lanes: Lanes, place: mi.Point3f, depth: mi.Float, u: mi.Float, *, scattered: bool
@@ -272,9 +279,9 @@ class LightMaps:
         cell, inside, level = self._cell(lanes, plane, place, depth)
         clear = mi.Float(dr.gather(mi.UInt32, self._clear, cell, inside))
         moment = mi.Float(dr.gather(mi.Int32, self._length, cell, inside))
-        later = moment / dr.maximum(clear, 1) * (_ENERGY_UNITS / _LENGTH_UNITS)
+        later = moment / dr.maximum(clear, 1) * (1 / _LENGTH_UNITS)
         energy = mi.Float(dr.gather(mi.UInt32, self._energy, cell, inside)) if scattered else clear
-        density = (0.5 * _CELLS) ** 2 / _ENERGY_UNITS / dr.square(dr.gather(mi.Float, self._half, plane))
+        density = (0.5 * self._cells) ** 2 / self._units / dr.square(dr.gather(mi.Float, self._half, plane))
         # Optical depths of the axis at the depth itself, above the mean sea level continued.
         at = dr.minimum(depth / self._step, self.count - 1)
         low = dr.minimum(mi.UInt32(dr.maximum(at, 0)), self.count - 2)

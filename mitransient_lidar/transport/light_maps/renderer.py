@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -19,17 +19,18 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.lidar.level_sea import refract_level
+from mitransient_lidar.physics.sea.shoaling import ShoalingHeights
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.two_way_spread import TwoWaySpread
-from mitransient_lidar.transport.light_maps.maps import HeightFields, LightMaps, Planes
+from mitransient_lidar.transport.light_maps.maps import FEWEST_CELLS, HeightFields, LightMaps, Planes
 from mitransient_lidar.transport.medium.water_phases import table_of
 from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index
 from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, ReceivedLight
 from mitransient_lidar.transport.paths.refracted_connection import StraightConnection
 from mitransient_lidar.transport.paths.ripple_focusing import Echo
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.probe import Rays
+from mitransient_lidar.transport.probe import Rays, first_along
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.solids import box_of, met_shape, scene_of_shapes
@@ -37,14 +38,8 @@ from mitransient_lidar.transport.solids import box_of, met_shape, scene_of_shape
 #: Numbers of the random sequences within a pass.
 _BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS = range(5)
 
-#: Rays of the view in a pass, those of the beam for each of them, and those that look for glints.
-_RAYS, _BEAM_PER_VIEW, _GLINTS_PER_VIEW = 512, 2, 8
-
-#: Planes of maps below the mean sea level, and depths at which each ray looks up the light of the water.
-_PLANES, _DEPTHS = 16, 16
-
-#: Paths of scattered light at each depth, and those that each ray looks up at the bottom.
-_PATHS, _PATHS_AT_BOTTOM = 2**12, 48
+#: Planes of maps below the mean sea level, and paths of scattered light at each depth.
+_PLANES, _PATHS = 16, 2**12
 
 #: Least downward component of rays in the air and in the water, and largest angle of the receiver from nadir [deg].
 _LEAST_DOWN, _LARGEST_ANGLE = 0.1, 45.0
@@ -68,11 +63,58 @@ _SHADOWED, _DEFLECTED = 0.1, 0.05
 #: Largest slope of a bottom on which displaced light arrives at another depth: steeper ones are sides.
 _STEEPEST = 1.0
 
+#: Least depth of the bottom below a beam [m], and rays of the beam that must reach it.
+_LEAST_DEPTH, _RAYS_TO_BED = 0.05, 64
+
+#: Reason against the light of shots over land, or over solids near the surface.
+REACH_THE_SURFACE = "solids reach the surface"
+
+#: Rays of the view for each pixel of an image, and their limits.
+_RAYS_PER_PIXEL, _FEWEST_RAYS, _MOST_RAYS = 16, 2**15, 2**21
+
+#: Cells of an image's maps in the shortest wave of its sea, their largest number along a side, and rays of the beam for
+#: each.
+_CELLS_PER_WAVE, _MOST_CELLS, _BEAM_PER_CELL = 2.5, 480, 4
+
 #: Distance beyond all waves that focus light [m].
 _FAR = 1e3
 
 #: Distance to the bottom of rays that meet none [m].
 _NO_BED = 1e6
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Numbers of rays in a pass, and of what they look up.
+
+    Attributes
+    ----------
+    rays
+        Rays of the view.
+    beam, glints
+        Rays of the beam, and those that look for glints, for each of them.
+    depths, at_bottom
+        Depths at which each ray of the view looks up light, and paths of scattered light at the bottom.
+    cells
+        Cells on each side of the maps.
+    """
+
+    rays: int = 512
+    beam: float = 2.0
+    glints: int = 8
+    depths: int = 16
+    at_bottom: int = 48
+    cells: int = FEWEST_CELLS
+
+    @classmethod
+    def of_image(cls, scene: LidarScene, planes: Planes) -> Sampling:
+        """Return the numbers for an image: many rays with few looks each, and cells finer than the waves."""
+        sea = scene.seas[0].sea
+        finest = sea.shortest_wave / _CELLS_PER_WAVE or sea.line_distance
+        wanted = 2 * float(planes.half[-1]) / finest / FEWEST_CELLS
+        cells = FEWEST_CELLS * int(np.clip(math.ceil(wanted), 1, _MOST_CELLS // FEWEST_CELLS))
+        rays = int(np.clip(_RAYS_PER_PIXEL * scene.receiver.pixels.count, _FEWEST_RAYS, _MOST_RAYS))
+        return cls(rays, max(_BEAM_PER_CELL * cells**2, _FEWEST_RAYS) / rays, 1, 4, 4, cells)
 
 
 @dataclass
@@ -114,7 +156,8 @@ class LightMapRenderer(PassRenderer):
 
     Paths that change more than once between down and up are left out, and the shadows of solids in the beam.
 
-    `level`: whether the sea is level, with all of its slopes as ripples, as the mean over seas.
+    `level`: whether the sea is level, with all of its slopes as ripples, as the mean over seas. `image`: whether a pass
+    is one of few for a render, instead of one for a shot among many.
 
     Raises
     ------
@@ -122,14 +165,17 @@ class LightMapRenderer(PassRenderer):
         If the scene is not suited.
     """
 
-    def __init__(self, scene: LidarScene, classes: PathClasses, *, level: bool = False) -> None:
-        if (reason := unsuited(scene)) is not None:
+    def __init__(self, scene: LidarScene, classes: PathClasses, *, level: bool = False, image: bool = False) -> None:
+        reason = unsuited(scene) or ((level or image) and scene.has_dry_solids and REACH_THE_SURFACE)
+        if reason:
             raise UnsuitedError(f"light maps do not suit the scene: {reason}")
         water, axis = scene.required_water, scene.receiver.pose.axis
         cos_water = -float(refract_level(axis, scene.refractive_index)[2])
-        self._planes = Planes.of_scene(scene, _deepest(scene, cos_water), _PLANES + 1)
+        planes = Planes.of_scene(scene, _deepest(scene, cos_water), _PLANES + 1)
+        self._sampling = Sampling.of_image(scene, planes) if image else Sampling()
+        self._planes = replace(planes, cells=self._sampling.cells)
         # Waves of the mesh enhance what cells average less than what meets at points.
-        super().__init__(scene, classes, _RAYS, _far_apart if level else self._planes.cell)
+        super().__init__(scene, classes, self._sampling.rays, _far_apart if level else self._planes.cell)
         column = water.column
         phases = [table_of(phase) for phase in water.phases.phases[: column.count]]
         spread = _spread_of(column, phases, self._planes.depths[1:], cos_water)
@@ -148,7 +194,7 @@ class LightMapRenderer(PassRenderer):
     @property
     def path_count(self) -> int:
         """Number of rays of a pass from either end."""
-        return self.paths * (1 + _BEAM_PER_VIEW)
+        return round(self.paths * (1 + self._sampling.beam))
 
     @property
     def used_values(self) -> dict[str, float]:
@@ -161,8 +207,8 @@ class LightMapRenderer(PassRenderer):
 
     def trace(self, received: ReceivedLight, shots: Shots, paths: int) -> None:
         """Look up the light of one pass for each shot, with a number of rays of the view."""
-        maps = self._maps(shots, _BEAM_PER_VIEW * paths)
-        self._reflect(received, shots, _GLINTS_PER_VIEW * paths)
+        maps = self._maps(shots, max(round(self._sampling.beam * paths), 1))
+        self._reflect(received, shots, self._sampling.glints * paths)
         seen = self._view(shots, paths)
         self._return(received, shots, paths, maps, seen, _WATER)
         if self.scene.solids:
@@ -197,7 +243,7 @@ class LightMapRenderer(PassRenderer):
         share = dr.full(mi.Float, 1 / count, dr.width(lanes.number))
         rays = self._enter(si, length, share, mi.TransportMode.Importance, ripple)
         dr.eval(rays)
-        maps = LightMaps(scene, self._planes, shots.count)
+        maps = LightMaps(scene, self._planes, shots.count, count)
         # Plane after plane, so that the lanes of a packet add to one map. Planes above troughs serve places below them.
         own, of_map = shots.paths(count * maps.count), opaque_index(count)
         plane = own.number // of_map
@@ -257,17 +303,17 @@ class LightMapRenderer(PassRenderer):
     ) -> None:
         """Add the light that returns from the water, or from the bottom, to rays of the view."""
         scene, water, from_bed = self.scene, self.scene.required_water, origin == _BOTTOM
-        per_ray, of_shot = _PATHS_AT_BOTTOM if from_bed else _DEPTHS, opaque_index(count)
+        per_ray, of_shot = self._sampling.at_bottom if from_bed else self._sampling.depths, opaque_index(count)
         # Depth after depth: neighbours in a packet read neighbours in maps.
         lanes = shots.paths(count * per_ray)
         part = lanes.number // of_shot
         seen = dr.gather(_Seen, seen, lanes.shot * of_shot + lanes.number - part * of_shot)
         u, pick, path = _spaced(shots, lanes, origin, 3)
-        rays, thickness = seen.rays, opaque(float(self._planes.depths[-1]) / _DEPTHS)
+        rays, thickness = seen.rays, opaque(float(self._planes.depths[-1]) / self._sampling.depths)
         # Before all light is received: a new number in memory ends the kernel.
         down, group_index = -rays.direction.z, opaque(scene.group_index)
         if from_bed:
-            along, place, path = seen.to_bed, seen.bed, (mi.Float(part) + path) / _PATHS_AT_BOTTOM
+            along, place, path = seen.to_bed, seen.bed, (mi.Float(part) + path) / per_ray
             active, turned = rays.active & (along < _NO_BED), seen.turned
         else:
             along = thickness * (mi.Float(part) + u) / down
@@ -299,7 +345,7 @@ class LightMapRenderer(PassRenderer):
         x, y, excess, of_bed, of_water = (dr.gather(mi.Float, one, entry) for one in self._spread)
         x, y, excess = x * scale, y * scale, excess * scale
         lit, way = maps.look_up(lanes, mi.Point3f(place.x + x, place.y + y, place.z), depth, pick, scattered=True)
-        share = (1 - dr.exp(-2 * scattered)) * (of_bed / _PATHS_AT_BOTTOM if from_bed else of_water)
+        share = (1 - dr.exp(-2 * scattered)) * (of_bed / per_ray if from_bed else of_water)
         if from_bed:
             # Half of the displacement lies on the way up.
             excess -= (seen.slope.x * x + seen.slope.y * y) / down
@@ -322,7 +368,7 @@ def _spread_of(
 
 
 def unsuited(scene: LidarScene) -> str | None:
-    """Return why light maps are not for a scene, or None."""
+    """Return why light maps are not for a scene, or None. Shots must also be `over_water`."""
     if scene.submerged:
         return "the lidar is under water"
     if scene.water is None or len(scene.surfaces) != 1 or len(scene.seas) != 1:
@@ -338,8 +384,8 @@ def unsuited(scene: LidarScene) -> str | None:
         return "its water has bubbles"
     if scene.perturbations.count:
         return "derivatives need paths"
-    if scene.has_veils or scene.has_shared_gaps or scene.has_specular_or_dry_solids:
-        return "solids are transparent, mirror-like, or reach the surface"
+    if scene.has_veils or scene.has_shared_gaps or scene.has_specular_solids:
+        return "solids are transparent or mirror-like"
     events = _events(scene)
     apart = (
         np.linalg.norm(scene.receiver.pose.origin - scene.transmitter.pose.origin) / scene.receiver.pose.ground_range
@@ -349,6 +395,35 @@ def unsuited(scene: LidarScene) -> str | None:
     if events > _MOST_EVENTS:
         return f"light scatters {events:.2g} times on its way to the bottom, more than {_MOST_EVENTS:g}"
     return None
+
+
+def over_water(scene: LidarScene, places: FloatArray, turns: FloatArray | None) -> BoolArray:
+    """Return which shots have solids below the sea alone in their beam, shape (shots,); arguments as `light_faintly`.
+
+    Rays of the beam, its outermost among them, pass the sea without meeting a solid, down to 0.05 m or, where waves do
+    not follow the bottom, to the lowest trough.
+    """
+    wet = np.ones(len(places), dtype=bool)
+    if not scene.has_dry_solids:
+        return wet
+    follows = isinstance(scene.seas[0].sea.waves, ShoalingHeights)
+    lowest = 0.0 if follows or scene.sea_heights is None else scene.sea_heights[0]
+    rays, pose = Rays.of_beam(scene, scene.transmitter), scene.transmitter.pose
+    start, end = (
+        (pose.origin + rays.directions * ((z - pose.origin[2]) / rays.directions[:, 2:]) - pose.ground_point())
+        for z in (pose.origin[2], min(lowest, -_LEAST_DEPTH))
+    )
+    outermost = np.argsort(-np.linalg.norm(end - end.mean(axis=0), axis=1))[: _RAYS_TO_BED // 2]
+    some = np.concatenate([outermost, np.linspace(0, len(end) - 1, _RAYS_TO_BED // 2).astype(np.intp)])
+    turned = np.ones(len(places), dtype=complex) if turns is None else turns @ [1, 1j]
+
+    def among_solids(points: FloatArray) -> FloatArray:
+        away = np.multiply.outer(turned, points[some, :2] @ [1, 1j])
+        level = np.stack([away.real, away.imag], axis=-1) + places[:, np.newaxis]
+        return np.insert(level.reshape(-1, 2), 2, np.tile(points[some, 2], len(places)), axis=1)
+
+    met = first_along(scene, scene.solids, [among_solids(start), among_solids(end)])[:, 2]
+    return np.asarray(np.isnan(met).reshape(len(places), -1).all(axis=1))
 
 
 def light_faintly(scene: LidarScene, target: mi.Shape, places: FloatArray, turns: FloatArray | None) -> BoolArray:

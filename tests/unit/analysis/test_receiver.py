@@ -11,7 +11,8 @@ from significance import largest_z
 from small_results import made
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.receiver import describe_recording, detect_waveforms
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.analysis.recorded import describe_recording
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
@@ -270,7 +271,7 @@ def test_records_without_advice_are_the_same():
     with_advice, without = (detect_waveforms(strong, CHAIN, seed=2, gain=0.5, advice=one) for one in (True, False))
     xr.testing.assert_equal(without, with_advice)
     told = {name for name in with_advice.attrs if name not in without.attrs}
-    assert told == {"fitting_gain", "fitting_optical_density"}
+    assert told == {"fitting_gain", "fitting_optical_density", "saturating_share"}
     chosen = [detect_waveforms(strong, CHAIN, seed=2, gain="auto", advice=one) for one in (True, False)]
     xr.testing.assert_equal(*chosen)
     assert chosen[0].attrs["gain"] == chosen[1].attrs["gain"] == chosen[1].attrs["fitting_gain"] < 1

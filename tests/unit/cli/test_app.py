@@ -88,7 +88,7 @@ def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path
     before = logger.propagate, logger.level, [*logger.handlers]
     monkeypatch.setattr("mitransient_lidar.results.dataset_of", lambda *_: logger.warning("early") or xr.Dataset())
     stub(monkeypatch, "record", lambda *_, **__: ())
-    monkeypatch.setattr("mitransient_lidar.analysis.receiver.describe_recording", lambda *_, **__: ())
+    monkeypatch.setattr("mitransient_lidar.analysis.recorded.describe_recording", lambda *_, **__: ())
     monkeypatch.setattr("mitransient_lidar.cli.analysis.write_netcdf", lambda *_: logger.warning("late"))
     done = run("record", tmp_path / "a.nc", *(["-q"] if quiet else []))
     assert done.exit_code == 0, done.output

@@ -17,10 +17,11 @@ _GIVEN = {"scene": "table1", "design": {"count": 3}, "scanner": {}, "platform": 
 
 
 def classes(base=Plan):
-    """Return all plans: those of flights and campaigns, and what they hold."""
+    """Return all plans by name: those of flights and campaigns, and what they hold."""
     assert {Campaign, FlightPlan} <= {*Plan.__subclasses__()}
     found = [one for sub in base.__subclasses__() for one in (sub, *classes(sub))]
-    return [one for one in found if not getattr(one, "__abstractmethods__", ()) and one._kinds]
+    plans = [one for one in found if not getattr(one, "__abstractmethods__", ()) and one._kinds]
+    return sorted(plans, key=lambda one: one.__qualname__)
 
 
 def usual(name, kind, option):

@@ -153,6 +153,17 @@ def test_notes_give_the_scale_of_intensities(tmp_path: Path, points: xr.Dataset)
     assert np.max(np.abs(step * read[3:] - points["intensity"][3:])) <= 0.5001 * step
 
 
+def test_echoes_between_surface_and_bottom_may_be_vegetation(tmp_path: Path, points: xr.Dataset) -> None:
+    """Class 46 of the draft profile, also in the notes; user data is the transmitter."""
+    kind, infrared = points["kind"].values, points["shot"].values % 2
+    points["kind"].attrs["object_class"] = 46
+    write_points(tmp_path / "points.las", points.assign(transmitter=("point", infrared)))
+    file = las_reader.read(tmp_path / "points.las")
+    assert b"46 submerged vegetation" in file.records["LASF_Spec", 3]
+    assert [point.classification for point in file.points] == np.where(kind == 43, 46, kind).tolist()
+    np.testing.assert_array_equal(laspy.read(tmp_path / "points.las").user_data, infrared)
+
+
 def test_points_without_an_echo_are_synthetic_and_doubtful_ones_withheld(tmp_path: Path, points: xr.Dataset) -> None:
     write_points(tmp_path / "points.las", points)
     file = las_reader.read(tmp_path / "points.las")

@@ -26,7 +26,8 @@ def tables(monkeypatch):
             self.kd = {"kd": params.get("kd"), "secchi": params and 1.6 / params.get("secchi", 8.0)}
             self.kd = self.kd["kd"] or self.kd["secchi"]
 
-        def table(self, low, high, corrections):
+        def table(self, site, further, corrections):
+            low, high = site.min(), further * site.max()
             depth = np.append(np.arange(low, high, 0.1), high)
             dims = ("off_nadir_deg", "wind_speed", "water", "depth", "estimator", "pixel")
             errors = {"bias": 0.01 * depth, "spread": 0 * depth, "error": 0.01 * depth, "found": chance(depth, self.kd)}

@@ -111,6 +111,18 @@ def test_turbid_water_without_a_visible_bottom_has_none():
     assert (bottom == EchoClass.NONE).all()
 
 
+def test_clear_seas_below_a_step_of_the_digitiser_are_no_land():
+    """A low gain rounds the column of the clearest water to nothing, which was taken for dry land."""
+    levels, glints = np.repeat([-0.1, 0.0, 0.1], 3), np.tile([0.02, 0.1, 0.5], 3)
+    clear = {"reflectance": 0.05, "attenuation": 0.04, "backscattering": 1.3e-3}
+    seas = [water(60, glint / 0.05, level=level, **clear) for level, glint in zip(levels, glints, strict=True)]
+    heights = np.array([0.5, 1.0, 3.0])
+    (surface, bottom), depth, _ = found(recorded([*seas, *map(land, heights)], 5, gain=0.012))
+    assert (surface[:9] == EchoClass.SURFACE).all()
+    assert (bottom[9:] == EchoClass.LAND).all()
+    np.testing.assert_allclose(depth[9:], -heights, atol=0.03)
+
+
 def test_turbid_water_seen_by_long_pulses_has_no_bottom():
     """A blurred bottom below a column of a free decay fits such columns as well, with more parameters."""
     kinds = [(k, b, glint) for k, b in ((0.5, 0.03), (0.75, 0.1)) for glint in (0.0, 0.02)]
@@ -139,9 +151,9 @@ def test_turbid_water_has_depths_with_true_errors():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "seed"), [(150, 3)])
-def test_error_rates_over_drawn_records(count, seed):
+def test_error_rates_over_drawn_records():
     """Land from 0.2 to 4 m, and water from 0.3 to 4 m with glints of all strengths, as `decide` states."""
+    count, seed = 90, 3
     rng = np.random.default_rng(seed + significance.seed_shift)
     heights, depths = rng.uniform(0.2, 4, count), np.exp(rng.uniform(np.log(0.3), np.log(4), count))
     glints = np.exp(rng.normal(-2, 2, count)) * (rng.random(count) < 0.7)
@@ -151,8 +163,8 @@ def test_error_rates_over_drawn_records(count, seed):
     (_, bottom), depth, error = found(recorded(powers, seed, gain=0.05))
     dry = np.arange(2 * count) < count
     wet = np.isin(bottom[~dry], [EchoClass.BOTTOM, EchoClass.MERGED])
-    assert np.count_nonzero(bottom[dry] != EchoClass.LAND) <= largest_count(count, 0.02)
-    assert np.count_nonzero(~wet) <= largest_count(count, 0.02)
+    assert np.count_nonzero(bottom[dry] != EchoClass.LAND) <= largest_count(count, 0.01)
+    assert np.count_nonzero(~wet) <= largest_count(count, 0.01)
     z = ((depth[~dry] - depths) / error[~dry])[wet]
     np.testing.assert_allclose(depth[dry], -heights, atol=0.02)
     assert np.mean(z**2) < variance_limits(np.count_nonzero(wet))[1]

@@ -255,7 +255,7 @@ def test_single_events_exceed_the_stated_height_in_one_of_a_thousand_records():
     """Dark counts alone, without the noise of the amplifier; the closed form is for one event in a bin."""
     detector = LinearDetector.avalanche(0.6, 150.0, 0.02, dark_current_na=2e-3)
     chain = ReceiverChain(detector, Amplifier(10e3, bandwidth_mhz=200.0))
-    records, bins, width = 30_000, 160, 0.2
+    records, bins, width = 10_000, 160, 0.2
     height = float(chain.event_height(np.zeros(bins), width))
     highest = chain.apply(np.zeros(bins), width, records, 5).signal.max(axis=-1)
     # Two events in a response are higher; those between two samples, and before the record, lower.
