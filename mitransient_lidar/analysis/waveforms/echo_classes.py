@@ -247,7 +247,7 @@ def decide(
         decay,
         waveforms.onset,
         opaque,
-        waveforms.baseline_stderr[(part.start + tested) % waveforms.baseline.size],
+        waveforms.level_stderr(part)[tested],
     )
     pulse, shape = waveforms.blurred_pulse, waveforms.echo_shape
     # The strongest of the first two.

@@ -276,6 +276,10 @@ class Waveforms:
         """Return the heights that single events of the detector reach, shape (waveforms,)."""
         return np.asarray(self.event_height[self._numbers(rows) % self.event_height.size])
 
+    def level_stderr(self, rows: Rows) -> FloatArray:
+        """Return the standard errors of weak steady signals, shape (waveforms,)."""
+        return np.asarray(self.baseline_stderr[self._numbers(rows) % self.baseline_stderr.size])
+
     def gain(self, rows: Rows) -> FloatArray:
         """Return the signal over that at the surface by distance, refraction and waves, shape (waveforms, time)."""
         lines = self.lines_of(rows)
