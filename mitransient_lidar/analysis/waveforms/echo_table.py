@@ -251,7 +251,7 @@ def _with_targets(part: dict[str, npt.NDArray[Any]], targets: int) -> dict[str, 
     """Return quantities with so many targets, of which those that are not there are unknown."""
     missing = targets + len(ECHOES) - 1 - part["flags"].shape[-1]
     filled = dict(part)
-    for name in _OF_ECHOES if missing > 0 else ():
+    for name in part.keys() & {*_OF_ECHOES} if missing > 0 else ():
         value = {"flags": int(EchoFlag.NO_ECHO), "class": int(EchoClass.NONE)}.get(name, np.nan)
         filled[name] = np.insert(part[name], [part[name].shape[-1] - 1] * missing, value, axis=-1)
     return filled
