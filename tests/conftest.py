@@ -35,7 +35,7 @@ def pytest_configure(config):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report(collector):
-    """Let every second worker import from the end: in a new clone, the workers share what is compiled to bytecode."""
+    """Let every second worker import from the end, so that two workers compile different modules in a new clone."""
     report = yield
     if isinstance(collector, pytest.Directory) and os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:] in "13579":
         report.result.reverse()

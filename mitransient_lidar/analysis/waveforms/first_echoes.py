@@ -49,26 +49,16 @@ _FIRST_BLUR = 0.01  # first guess of the variance of a blur, relative to the lar
 
 @dataclass(frozen=True)
 class FirstEchoes:
-    """What the first echoes of n records are.
+    """What the first echoes of n records are."""
 
-    Attributes
-    ----------
-    chance
-        Probabilities of land, of a surface with water whose bottom is not seen, and of a bottom, shape (3, n).
-    bottom, surface
-        Land or bottom, and the surface before a bottom where it has an echo of its own that is told apart.
-    surface_ns, surface_stderr
-        Arrival of the surface of a bottom and its standard deviation [ns], shape (n,); NaN for land.
-    film_ns
-        Delay by water that may stand on land, root mean square over both possibilities [ns], shape (n,).
-    """
-
-    chance: FloatArray
+    chance: FloatArray  #: Probabilities of land, of a surface whose bottom is not seen, and of a bottom, shape (3, n).
+    #: Land or bottom, and the surface before a bottom where it has an echo of its own that is told apart.
     bottom: Echoes
     surface: Echoes
+    #: Arrival of the surface of a bottom and its standard deviation [ns], shape (n,); NaN for land.
     surface_ns: FloatArray
     surface_stderr: FloatArray
-    film_ns: FloatArray
+    film_ns: FloatArray  #: Delay by water on land, root mean square over land and bottom [ns], shape (n,).
 
     def part(self, rows: BoolArray) -> FirstEchoes:
         """Return those of some of the records."""

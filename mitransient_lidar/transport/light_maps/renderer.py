@@ -85,26 +85,16 @@ _NO_BED = 1e6
 
 @dataclass(frozen=True)
 class Sampling:
-    """Numbers of rays in a pass, and of what they look up.
+    """Numbers of rays in a pass, and of what they look up."""
 
-    Attributes
-    ----------
-    rays
-        Rays of the view.
-    beam, glints
-        Rays of the beam, and those that look for glints, for each of them.
-    depths, at_bottom
-        Depths at which each ray of the view looks up light, and paths of scattered light at the bottom.
-    cells
-        Cells on each side of the maps.
-    """
-
-    rays: int = 512
+    rays: int = 512  #: Rays of the view.
+    #: Rays of the beam, and those that look for glints, for each of them.
     beam: float = 2.0
     glints: int = 8
+    #: Depths at which each ray of the view looks up light, and paths of scattered light at the bottom.
     depths: int = 16
     at_bottom: int = 48
-    cells: int = FEWEST_CELLS
+    cells: int = FEWEST_CELLS  #: Cells on each side of the maps.
 
     @classmethod
     def of_image(cls, scene: LidarScene, planes: Planes) -> Sampling:
