@@ -191,14 +191,14 @@ class LidarMerging(LidarPassIntegrator):
     Cells end above the first solid below the surface. Other cells begin below a solid that lets a share of the light
     pass, such as a mask or a pane. Through a second such solid they blur the light by their thickness.
 
-    Cells blur the light by their width: where waves focus both beam and field of view, the signal is biased low. Cells
-    follow the surface and are sheared along the beam. Times and absorption are taken at the receiver's point. Patches
-    cut by edges count by their covered share. Over 6 m/s waves, the published geometry's water signal differs from the
-    reference by 0.04 +- 0.12 % in the first metre and 0.01 +- 0.06 % below. At 75 degrees over 3 m/s waves, it differs
-    by -1.4 +- 0.6 and -0.5 +- 0.5 %. A 1 mrad beam at 40 degrees over 10 m/s meets several facets. It differs by -2 +-
-    1 % from 1 to 2 ns after its first light, and by -0.1 +- 0.1 % in the column. Wider cells (``cell_size``) have more
-    bias. A beam may be up to 1000 attenuation lengths wide. Derivatives come from `mitransient_lidar.render`, not from
-    Mitsuba's gradients.
+    Cells blur the light by their width where waves focus both beam and field of view. With ``ripple_focusing``, a
+    factor restores the mean over seas. Cells follow the surface and are sheared along the beam. Times and absorption
+    are taken at the receiver's point. Patches cut by edges count by their covered share. Over 6 m/s waves, the
+    published geometry's water signal differs from the reference by 0.04 +- 0.12 % in the first metre and 0.01 +- 0.06 %
+    below. At 75 degrees over 3 m/s waves, it differs by -1.4 +- 0.6 and -0.5 +- 0.5 %. A 1 mrad beam at 40 degrees over
+    10 m/s meets several facets. It differs by -2 +- 1 % from 1 to 2 ns after its first light, and by -0.1 +- 0.1 % in
+    the column. Wider cells (``cell_size``) have more bias in the first metre. A beam may be up to 1000 attenuation
+    lengths wide. Derivatives come from `mitransient_lidar.render`, not from Mitsuba's gradients.
 
     .. example::
 

@@ -4,12 +4,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from significance import assert_equal, largest_chi2, largest_error, largest_z, mean_and_error
+from significance import assert_equal, assert_same, largest_chi2, largest_error, largest_z, mean_and_error
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.transport.merging import renderer as merging_renderer
 from mitransient_lidar.transport.merging.cells import RefractedProfile, WaterCells
+from mitransient_lidar.transport.merging.layout import MergingLayout, MergingOptions
 from mitransient_lidar.transport.merging.patches import SolidPatches, foreshortening, solids_of_several_levels
 from mitransient_lidar.transport.merging.region import Region, SurfaceHeights
 from mitransient_lidar.transport.merging.rings import BeamRings
@@ -413,3 +414,33 @@ def test_every_second_path_of_an_image_stands_for_two(monkeypatch):
     lit = (means[0] > 0) & (means[1] > 0)
     z = (means[1] - means[0])[lit] / np.hypot(*errors)[lit]
     assert np.abs(z).max() < largest_z(10, lit.sum())
+
+
+@pytest.mark.slow
+def test_cells_wider_than_light_patterns_keep_their_mean():
+    """Water at 1.5 to 3 m below waves from 0.35 m, with cells of 0.1 m: without the enhancement it is 5 % low."""
+    water = {"attenuation": "0.1", "scattering": "0.02", "backscattering": "0.001"}
+    params = {"layout": "1x1", "shortest_wave": "0.35", "cell_size": "0.05", **water}
+    session = open_scene("fig09_2x2", params)
+    found = []
+    for integrator in ({**MERGING, "cell_size": 0.1}, {"type": "lidar_volpath", "paths_per_pass": 2**16}):
+        renderer = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor)
+        depth = (renderer.scene.axis.centres_ns - renderer.probe.echoes.surface_ns.mean()) / 9.246
+        used = (depth > 1.5) & (depth <= 3)
+        passes = [renderer.render_pass(seed).histogram.energy().ravel()[used].sum() for seed in range(32)]
+        found.append(np.array(passes)[:, np.newaxis])
+    assert_same(*found, error=0.007)
+
+
+def test_sides_are_those_of_the_cells_about_the_beam(wavy_sea):
+    """Sides by depth against areas of cells that contain points of the beam, in cells of one pass."""
+    lidar, _ = wavy_sea
+    cells = MergingLayout.of_probe(Probe(lidar), MergingOptions()).cells
+    rng = np.random.default_rng(3)
+    angles = rng.normal(scale=float(lidar.transmitter.angular_spread) * 213, size=(2, 2**14))
+    for depth in (1.0, 4.0):
+        above = cells.depth_of(cells.layer_at(mi.Float(depth)) - 0.5)
+        x, y = (mi.Float(side) for side in angles)
+        sector = cells.rings.sector(x, y, cells.rings.core(above), cells.widths(above), mi.Point2f(0.3, 0.6))
+        squares = np.array(cells.rings.area(sector) * cells.rings.cosine)
+        assert cells.sides(np.array([depth]))[0] == pytest.approx(np.sqrt(squares.mean()), rel=0.03)

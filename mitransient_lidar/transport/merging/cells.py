@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.merging.region import SurfaceHeights
 from mitransient_lidar.transport.merging.rings import BeamRings
 from mitransient_lidar.transport.opaque import changed, opaque, opaque_point
@@ -236,6 +237,13 @@ class WaterCells:
         thin = dr.exp(dr.minimum(layers, self._layers) * _THICKNESS_PER_DEPTH) - 1
         even = dr.maximum(layers - self._layers, 0) * self.thickness
         return dr.fma(thin, self._uppermost / _THICKNESS_PER_DEPTH, even)
+
+    def sides(self, depths: FloatArray) -> FloatArray:
+        """Return the sides of cells [m], rms over the beam, in which light and view meet at depths [m], shape (n,)."""
+        depth = mi.Float(depths.astype(np.float32))
+        above = dr.maximum(dr.fma(-0.5, self.thickness_at(depth), depth), 0)
+        side = self.widths(above) * dr.sqrt(dr.square(self.rings.core(above)) + 2 * dr.square(self.rings.spread))
+        return np.asarray(side.numpy(), np.float64)
 
     def of_pass(self, shift: mi.Point4f) -> WaterCells:
         """Return the cells of a pass, shifted by four uniform random numbers per shot."""

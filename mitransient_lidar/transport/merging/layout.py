@@ -130,6 +130,11 @@ class MergingLayout:
         # A copy has its own capacities.
         return replace(self, cells=cells, patches=patches)
 
+    def cell_sides(self, depths: FloatArray) -> FloatArray:
+        """Return the sides of the cells below a sea [m], as of `WaterCells.sides`."""
+        assert isinstance(self.cells, WaterCells)
+        return self.cells.sides(depths)
+
     def coarse(self) -> MergingLayout:
         """Return a layout with the same points and wider cells, for differences of scenes."""
         cells = self.cells.of_even_width(_COARSE) if isinstance(self.cells, WaterCells) else self.cells

@@ -20,6 +20,7 @@ from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, 
 from mitransient_lidar.transport.paths.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.paths.refracted_connection import connect_laser, perturbed_to_laser
 from mitransient_lidar.transport.paths.volpath import VolpathOptions, trace_connected
+from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.rng import Shots, tiled
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS
@@ -69,9 +70,10 @@ class MergingRenderer(PassRenderer):
         connections: bool = True,
     ) -> None:
         pixels = scene.receiver.pixels.count
-        super().__init__(scene, classes, paths_of_pass(options, pixels))
+        probe = Probe(scene)
+        self.layout = layout.of_scene_alike(scene) if layout else MergingLayout.of_probe(probe, options)
+        super().__init__(scene, classes, paths_of_pass(options, pixels), self.layout.cell_sides, probe)
         self.photons = options.photons_per_pass or (_PHOTONS_FOR_IMAGES if pixels >= IMAGE_PIXELS else PHOTONS)
-        self.layout = layout.of_scene_alike(scene) if layout else MergingLayout.of_probe(self.probe, options)
         self._connections = connections
         self._merges_solids = not scene.has_shared_gaps if options.solids == "auto" else options.solids == "merged"
         self._beam = BeamSampler(scene.transmitter, scene.receiver, self.layout.spread)

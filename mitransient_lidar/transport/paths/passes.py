@@ -196,12 +196,13 @@ class PassRenderer(ABC):
         classes: PathClasses,
         paths: int,
         cells: Callable[[FloatArray], FloatArray] | None = None,
+        probe: Probe | None = None,
     ) -> None:
         self.scene, self.paths = scene, paths
         #: Enhancement by ripples, or None; `cells` as of `RippleFocusing.of_scene`.
         self.focusing = RippleFocusing.of_scene(scene, cells)
         self.classes = replace(classes, counted=self.focusing is not None)
-        self.probe = Probe(scene)
+        self.probe = probe or Probe(scene)
         self.sampler = self.probe.sampler
 
     @property
