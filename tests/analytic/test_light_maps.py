@@ -111,7 +111,10 @@ def test_series_by_maps_are_rendered_again():
     [
         ({"light": "paths"}, "light = 'paths' must be one of merging, maps"),
         ({"light": "maps", "derivatives": "attenuation"}, "light = 'maps' has no derivatives"),
-        ({"light": "maps", "params": {"off_nadir_deg": 60}}, "light maps do not suit the scene: the receiver looks"),
+        (
+            {"light": "maps", "params": {"off_nadir_deg": 60}},
+            "maps do not suit the scene: the receiver looks more than 45 degrees from nadir; use light = 'merging'",
+        ),
     ],
 )
 def test_what_maps_are_not_for(options, message):

@@ -423,7 +423,7 @@ def require_water(lidar: LidarScene, poses: ShotPoses) -> None:
     """Raise `UnsuitedError` if light maps do not suit shots, since they meet land, or solids near the surface."""
     dry = ~over_water(lidar, poses.places - lidar.frame_origin[:2], poses.turns)
     if dry.any():
-        raise UnsuitedError(f"light maps do not suit the scene: {REACH_THE_SURFACE} in {np.count_nonzero(dry)} shots")
+        raise UnsuitedError(f"{REACH_THE_SURFACE} in {np.count_nonzero(dry)} shots")
 
 
 def share_for_error(error: float) -> float:

@@ -138,7 +138,10 @@ class _Seen:
 
 
 class UnsuitedError(UserError):
-    """A scene that light maps are not for."""
+    """A scene that light maps are not for, for a reason, and what to use `instead`."""
+
+    def __init__(self, reason: str, instead: str = "light = 'merging'") -> None:
+        super().__init__(f"light maps do not suit the scene: {reason}; use {instead}")
 
 
 class LightMapRenderer(PassRenderer):
@@ -158,7 +161,7 @@ class LightMapRenderer(PassRenderer):
     def __init__(self, scene: LidarScene, classes: PathClasses, *, level: bool = False, image: bool = False) -> None:
         reason = unsuited(scene) or ((level or image) and scene.has_dry_solids and REACH_THE_SURFACE)
         if reason:
-            raise UnsuitedError(f"light maps do not suit the scene: {reason}")
+            raise UnsuitedError(reason, *(["render"] if level else []))
         water, axis = scene.required_water, scene.receiver.pose.axis
         cos_water = -float(refract_level(axis, scene.refractive_index)[2])
         planes = Planes.of_scene(scene, _deepest(scene, cos_water), _PLANES + 1)
