@@ -27,6 +27,7 @@ _OF_SKEW = 0.25  # of a resolved echo, relative to the spread of the arrival ove
 _OF_LEVEL_SURFACE, _OF_WAVES, _OF_COLUMN = 0.4, 0.85, 1.0  # of the time of a surface, relative to this spread
 _OF_PULSE, _OF_LOST_PULSE = 0.03, 0.15  # of the time of a surface, distinct and not, relative to the pulse
 _LEAST_SHARE = 0.05  # of the beam in a pixel whose column counts, relative to the brightest pixel
+_SMALLEST_SHARE = 1e-9  # of the beam in a pixel that results store
 _TYPICAL_ATTENUATION = 0.14  # of a column that is too short for a fit [1/m]
 _TYPICAL_BACKSCATTERING = 0.05  # relative to the attenuation of the column
 TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
@@ -164,6 +165,19 @@ class DepthErrors:
         neighbours = lines.depth_of_delay(share * self._from_all_pixels(time_ns))
         of_pixel = np.hypot(relative.reshape(shape) * depth, constant.reshape(shape))
         return np.asarray(np.hypot(of_pixel, neighbours))
+
+    def of_scattered_light(self, depth: FloatArray, dark: BoolArray) -> FloatArray:
+        """Return the errors of depths [m], shape (n, ...), in pixels without direct light, shape (n,), 0 in others.
+
+        Light that is scattered to such a pixel, at the distance r from the beam's axis, has slant paths to the bottom
+        and back, by sqrt(d^2 + r^2) - d longer than the depth d. The distance is that at which a Gaussian beam has the
+        pixel's share of the brightest pixel's light, stored to 9 decimals.
+        """
+        share = np.nan_to_num(self.lines.beam_share)
+        relative = np.maximum(share, _SMALLEST_SHARE) / max(float(share.max(initial=0.0)), _SMALLEST_SHARE)
+        away = np.where(dark, self.beam_width * np.sqrt(-0.5 * np.log(relative)), 0.0)
+        below = np.maximum(depth, 0)
+        return np.asarray(np.hypot(below, away.reshape(-1, *(1,) * (depth.ndim - 1))) - below)
 
     def attenuation_times_backscattering(self, attenuation: FloatArray, level: FloatArray) -> FloatArray:
         """Return K bb of the columns [1/m^2], shape (n,), with one bb for all pixels of a shot."""

@@ -26,6 +26,7 @@ _EVENT = 0.8  # height of a single event after the detection filter
 _BEFORE = 0.6  # weight of the signal one reach before an echo beside the mean from one to two reaches behind it
 _EARLY = 3.0  # thresholds, or heights of single events, above which an echo counts before the sea's
 _GONE = 0.8  # signal two reaches behind the last echo, relative to the column before it
+_BRIGHTER = 1.5  # largest signal behind a bottom, relative to it: light of wider paths may have a peak of its own
 _REACH = 1.5  # distance from an echo to the signal around it, in echo widths
 _BEHIND_EDGE, _STAYS = (0.8, 1.2), 0.15  # reaches behind an edge, and the share of its rise that is left there
 _LEAST_COLUMN = 0.1  # column before an edge, relative to the peak
@@ -264,11 +265,11 @@ def find_echoes(
     interpolated between both sides; or where w(t+2d) is below 0.8 w(t-d), as behind a bottom, w(t-d)^0.6 v^0.4 with
     the mean v of w from t+d to t+2d. An exponential exceeds none: neither the column nor a step down in it is a peak.
     Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, those
-    before it are targets; peaks below a fiftieth of the strongest are ignored, and of peaks less than an echo width
-    apart the strongest counts. Behind the upper edge of a turbid layer the signal does not fall back to the column
-    above it: such a rise is no echo. Waves focus the light of a shot,
-    so that its column has peaks: below them, targets rise above the column by at least half of it, and near the surface
-    also of the column behind them.
+    before it are targets; peaks below two thirds of what follows the last one are none. Peaks below a fiftieth of
+    the strongest are ignored, and of peaks less than an echo width apart the strongest counts. Behind the upper
+    edge of a turbid layer the signal does not fall back to the column above it: such a rise is no echo. Waves focus
+    the light of a shot, so that its column has peaks: below them, targets rise above the column by at least half of
+    it, and near the surface also of the column behind them.
 
     Parameters
     ----------
@@ -348,6 +349,10 @@ def find_echoes(
     few = np.broadcast_to(np.asarray(event_height, dtype=np.float64), surface.shape)[:, np.newaxis] * _EVENT
     strong = peaks & (excess >= few)
     peaks = np.where(strong.any(axis=1, keepdims=True), strong, peaks)
+    # Light behind a bottom is not much brighter: such a peak is on the rise of light that the water has scattered.
+    last = count - 1 - np.argmax(peaks[:, ::-1], axis=1)[:, np.newaxis]
+    later = np.max(np.where(bins > last + apart, power, -np.inf), axis=1, keepdims=True)
+    peaks &= _BRIGHTER * power > later - threshold * noise
     bottom = np.where(peaks.any(axis=1), count - 1 - np.argmax(peaks[:, ::-1], axis=1), -1)
     before = peaks & (bins < (bottom - apart)[:, np.newaxis])
     if waves:

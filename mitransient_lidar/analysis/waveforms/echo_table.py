@@ -425,6 +425,7 @@ def _with_depths(
     from_mean = settings.depth_from == "mean"
     level = np.where(waveforms.unit == "W", table["amplitude"][:, 0, ECHOES.index("column")], np.nan)
     by_water = errors.of_echoes(time, table["depth_m"], table["attenuation"], level, from_mean=from_mean)
+    by_water = np.hypot(by_water, errors.of_scattered_light(table["depth_m"], dark))
     # The surface is where depths count from, or an echo of its own.
     by_water[..., 0] = 0
     film = table.pop("film_ns")[:, np.newaxis, np.newaxis]

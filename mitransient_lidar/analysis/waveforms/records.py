@@ -16,7 +16,7 @@ from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Fadin
 from mitransient_lidar.analysis.waveforms.depth_errors import HEIGHTS, column_gain
 from mitransient_lidar.analysis.waveforms.echo_detection import Records
 from mitransient_lidar.analysis.waveforms.echo_shape import BlurredPulse, EchoShape, Response, Template
-from mitransient_lidar.analysis.waveforms.saturation import level_error
+from mitransient_lidar.analysis.waveforms.saturation import inflation, level_error
 from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, LEVEL, SurfaceLevel
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
@@ -179,7 +179,7 @@ class Waveforms:
             dark = calm[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet))
             baseline = dark.mean(axis=(0, 2))
             rest = dark - baseline[:, np.newaxis]
-            baseline_error = level_error(rest, _inflation(rest, run), samples[: _MOST_SHOTS * pixels])
+            baseline_error = level_error(rest, inflation(rest, run), samples[: _MOST_SHOTS * pixels])
         deviation, shared = _noise(dataset, name, samples, calm, baseline, quiet, noise, run), None
         if name == "waveform" and noise is None and "waveform_stderr" in dataset:
             deviation, shared = _noise_of_render(dataset, deviation, run)
@@ -450,25 +450,25 @@ def _receiver_noise(
         own = slice(0, len(shots) * pixels)
         floored = np.where(stated > 0, stated, 1.0)
         known = (shots - mean[own].reshape(-1, pixels, count)) / floored[own].reshape(-1, pixels, count)
-        return np.asarray(stated * _inflation(known, run))
+        return np.asarray(stated * inflation(known, run))
     if np.count_nonzero(quiet) < _FEWEST_QUIET:
         raise UserError(f"noise must be given: the record has less than {_FEWEST_QUIET} bins before the surface echo")
     rest = calm[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)) - baseline[:, np.newaxis]
     spread = np.sqrt(np.mean(rest**2, axis=(0, 2)))[:, np.newaxis]
     if "signal_deviation" not in dataset:
-        return np.asarray(spread * _inflation(rest, run))
+        return np.asarray(spread * inflation(rest, run))
     # The scatter of a sample at a limit is smaller than its error.
     deviation = dataset["signal_deviation"].values.reshape(-1, pixels, count)
     deviation = np.maximum(deviation, spread)
     shots = samples[: _MOST_SHOTS * pixels].reshape(-1, pixels, count)
     # Jitter moves and scales whole echoes from shot to shot, which is no noise of their samples.
     if len(shots) < _FEWEST_SHOTS or "receiver.jitter" in dataset.attrs:
-        return np.asarray(deviation.reshape(-1, count) * _inflation(rest, run))
+        return np.asarray(deviation.reshape(-1, count) * inflation(rest, run))
     # The noise has a larger correlation in an echo than in the dark. Shots of one place differ by noise alone.
     of_each = "shot" in dataset["signal_deviation"].dims and "signal_mean" in dataset
     mean = dataset["signal_mean"].values.reshape(-1, pixels, count)[: len(shots)] if of_each else shots.mean(axis=0)
     floored = np.where(deviation > 0, deviation, 1.0)[: len(shots)]
-    return np.asarray(deviation.reshape(-1, count) * _inflation((shots - mean) / floored, run))
+    return np.asarray(deviation.reshape(-1, count) * inflation((shots - mean) / floored, run))
 
 
 def _without_gaps(
@@ -491,16 +491,3 @@ def _block_levels(dataset: xr.Dataset, pixels: int) -> tuple[FloatArray, FloatAr
     if dark.size != pixels or level.size != pixels or not np.all(level > dark) or not np.isfinite(level - dark).all():
         raise UserError("dark_level and block_level must have a finite number for each pixel, and the second be larger")
     return dark, level
-
-
-def _inflation(rest: FloatArray, run: int) -> float:
-    """Return the standard deviation of means of `run` neighbouring samples over that of independent samples.
-
-    NaN are missing samples.
-    """
-    run = min(run, rest.shape[-1])
-    blocks = rest.shape[-1] // run
-    means = rest[..., : blocks * run].reshape(*rest.shape[:-1], blocks, run).mean(axis=-1)
-    known = means[np.isfinite(means)]
-    variance = float(np.mean(rest[np.isfinite(rest)] ** 2)) if known.size else 0.0
-    return math.sqrt(max(run * float(np.mean(known**2)) / variance, 1.0)) if variance > 0 else 1.0

@@ -1,4 +1,4 @@
-"""Limits of samples: how long they are clipped about echoes, which of these meet a bottom twice, and their steps."""
+"""Limits of samples: how long echoes are clipped, which of these meet a bottom twice, and steps and noise."""
 
 from __future__ import annotations
 
@@ -73,14 +73,14 @@ def may_be_second_return(
     return np.asarray(clipped & (np.arange(time_ns.shape[-1]) > 1))
 
 
-def level_error(rest: FloatArray, inflation: float, samples: npt.NDArray[np.floating]) -> FloatArray:
+def level_error(rest: FloatArray, inflated: float, samples: npt.NDArray[np.floating]) -> FloatArray:
     """Return the standard error of weak steady signals above the level without light, shape (pixels,).
 
     Parameters
     ----------
     rest
         Samples without light less this level, shape (shots, pixels, bins).
-    inflation
+    inflated
         Standard deviation of means of neighbouring samples over that of independent ones.
     samples
         Samples with light, whose least difference is the step of the digitiser.
@@ -96,4 +96,17 @@ def level_error(rest: FloatArray, inflation: float, samples: npt.NDArray[np.floa
     scatter = np.asarray(rest.std(axis=(0, 2)), dtype=np.float64)
     noise = np.maximum(scatter**2 - (step * _OF_UNIFORM) ** 2, 0)
     rounding = math.sqrt(2) * _OF_UNIFORM * step * np.exp(-2 * (math.pi / step) ** 2 * noise) if step > 0 else 0.0
-    return np.hypot(inflation * scatter / math.sqrt(rest[:, 0].size), rounding)
+    return np.hypot(inflated * scatter / math.sqrt(rest[:, 0].size), rounding)
+
+
+def inflation(rest: FloatArray, run: int) -> float:
+    """Return the standard deviation of means of `run` neighbouring samples over that of independent samples.
+
+    NaN are missing samples.
+    """
+    run = min(run, rest.shape[-1])
+    blocks = rest.shape[-1] // run
+    means = rest[..., : blocks * run].reshape(*rest.shape[:-1], blocks, run).mean(axis=-1)
+    known = means[np.isfinite(means)]
+    variance = float(np.mean(rest[np.isfinite(rest)] ** 2)) if known.size else 0.0
+    return math.sqrt(max(run * float(np.mean(known**2)) / variance, 1.0)) if variance > 0 else 1.0

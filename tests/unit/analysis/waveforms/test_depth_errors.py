@@ -96,6 +96,15 @@ def test_scattered_light_counts_with_the_beam_inside_the_view():
     assert 0.001 < wide / 8 < 0.02
 
 
+@pytest.mark.parametrize("depth", [3.0, 12.0, 20.0])
+def test_light_scattered_beside_the_beam_has_slant_paths(depth):
+    """A Gaussian beam of 2.8 mrad from 400 m, whose share beyond 2.8 m is 3.73e-6; the other pixel has its light."""
+    one = replace(errors(), beam_width=1.12)
+    one = replace(one, lines=replace(one.lines, beam_share=np.array([1.0, 3.73e-6])))
+    found = one.of_scattered_light(np.full((2, 1), depth), np.array([False, True]))
+    np.testing.assert_allclose(found, [[0], [math.hypot(depth, 2.8) - depth]], rtol=0.01)
+
+
 @pytest.mark.slow
 def test_published_biases_of_depth_appear_in_rendered_results():
     """Turbid water: 8 m too deep at nadir, too shallow far off it, by undercutting (Guenther and Thomas 1984)."""

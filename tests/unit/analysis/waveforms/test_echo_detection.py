@@ -167,6 +167,16 @@ def test_a_column_is_no_echo_nor_is_a_step_down_in_it():
     assert found.flags[2].tolist() == [EchoFlag.NO_ECHO] * 2
 
 
+def test_a_ripple_on_the_rise_of_scattered_light_is_no_bottom():
+    """Pixels beside the beam: light reaches them late, by scattering, and fades; a bottom below it is found."""
+    later = np.maximum(TIME - 40, 0) / 20
+    rise = 2 * later**2 * np.exp(2 - 2 * later) + echoes(46.0, 0.2)[0]
+    signal = np.stack([rise, rise + echoes(150.0, 1.0)[0]])
+    found = find_echoes(Records.of(signal, TIME, 0.004), FWHM, latest_ns=40.0)
+    assert found.bins[2][0] == -1
+    assert TIME[found.bins[2][1]] == pytest.approx(150, abs=DT)
+
+
 def test_a_bottom_at_any_distance_from_the_surface_is_one_echo():
     """Near the surface another criterion holds, whose border cuts through some of the echoes."""
     arrivals = np.arange(55, 90, 0.25)
