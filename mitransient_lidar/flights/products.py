@@ -65,18 +65,10 @@ class Quality(IntFlag):
 
 @dataclass(frozen=True)
 class Flown:
-    """Pulses of a store that are rendered, in the order of their times.
+    """Pulses of a store that are rendered, in the order of their times."""
 
-    Attributes
-    ----------
-    store
-        The store.
-    rows
-        Their rows in it.
-    """
-
-    store: Store
-    rows: IntArray
+    store: Store  #: The store.
+    rows: IntArray  #: Their rows in it.
 
     @classmethod
     def of(cls, store: Store) -> Flown:

@@ -76,34 +76,21 @@ class RefractedPaths:
     With the normal m of the surface, Snell's law is w = d/n + (c/n - c_w) m, where c = -d . m and
     c_w^2 = 1 - (1 - c^2)/n^2. The length in the water is s = (T - R)/n_g with T = R_s + n_g D/cos(theta_w): R_s and D
     are the range of the surface and the depth by the echoes, theta_w is the refracted angle of a level sea.
-
-    Attributes
-    ----------
-    direction, refracted
-        Unit directions d and w, shape (n, 3).
-    distance, length
-        R and s [m], shape (n,); s is 0 for points on the surface.
-    facets
-        Surface where the paths cross it.
-    in_water, on_model
-        Whether a point is in the water, and whether R is that of the facets instead of R_s.
-    origin
-        Position of the lidar o [m], shape (n, 3).
-    timing
-        What the echoes say.
-    index, group_index
-        Refractive and group index of the water.
     """
 
-    origin: FloatArray
+    origin: FloatArray  #: Position of the lidar o [m], shape (n, 3).
+    #: Unit directions d and w, shape (n, 3).
     direction: FloatArray
     refracted: FloatArray
+    #: R and s [m], shape (n,); s is 0 for points on the surface.
     distance: FloatArray
     length: FloatArray
-    facets: Facets
+    facets: Facets  #: Surface where the paths cross it.
+    #: Whether a point is in the water, and whether R is that of the facets instead of R_s.
     in_water: BoolArray
     on_model: BoolArray
-    timing: Timing
+    timing: Timing  #: What the echoes say.
+    #: Refractive and group index of the water.
     index: float
     group_index: float
 

@@ -39,33 +39,17 @@ class Facets(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceModel:
-    """Mean level of the sea and, with surface points, local planes through them.
+    """Mean level of the sea and, with surface points, local planes through them."""
 
-    Attributes
-    ----------
-    level
-        Mean height [m], with the tide.
-    level_error
-        Its standard error [m].
-    height_deviation
-        Standard deviation of the sea's heights about the level [m].
-    slope_deviation
-        Standard deviation of the sea's slopes, averaged over a beam, in each direction [1].
-    radius
-        Radius of the planes [m]; 0 for a level sea.
-    points
-        Surface points for planes: x, y, z, standard deviation of z [m], time [s], shape (n, 5).
-    residual
-        Standard deviation of the points about planes, by waves that are shorter [m].
-    """
-
-    level: float = 0.0
-    level_error: float = 0.0
-    height_deviation: float = 0.0
+    level: float = 0.0  #: Mean height [m], with the tide.
+    level_error: float = 0.0  #: Its standard error [m].
+    height_deviation: float = 0.0  #: Standard deviation of the sea's heights about the level [m].
+    #: Standard deviation of the sea's slopes, averaged over a beam, in each direction [1].
     slope_deviation: float = 0.0
-    radius: float = 0.0
+    radius: float = 0.0  #: Radius of the planes [m]; 0 for a level sea.
+    #: Surface points for planes: x, y, z, standard deviation of z [m], time [s], shape (n, 5).
     points: FloatArray | None = None
-    residual: float = 0.0
+    residual: float = 0.0  #: Standard deviation of the points about planes, by waves that are shorter [m].
 
     @classmethod
     def fit(

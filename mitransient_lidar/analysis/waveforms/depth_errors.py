@@ -38,42 +38,21 @@ HEIGHTS = 8.0
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Method errors of depths measured by Gaussian decomposition.
+    """Method errors of depths measured by Gaussian decomposition."""
 
-    Attributes
-    ----------
-    lines : LinesOfSight
-        Lines of sight with arrays of shape (n,), n waveforms, all pixels of a shot before the next shot.
-    shots : int
-        Number of shots.
-    beam_width
-        Diameter of the beam at e^-1/2 of its peak, or of the view if that is smaller, on the sea [m].
-    pulse_ns
-        Full width of an ideal echo at half maximum [ns].
-    refractive_index, group_index
-        Indices of the water.
-    slope
-        Standard deviation of the slopes averaged over a pixel [1], 0 for a level sea with ripples.
-    height
-        Standard deviation of the sea's height [m].
-    slope_variance
-        Variance of all slopes [1].
-    gain
-        Power of the column at the surface per backscattering coefficient [W m], NaN if unknown.
-    bin_ns
-        Width of the bins in which light was recorded before pulse and response [ns], 0 if it was not rendered.
-    """
-
+    #: Lines of sight with arrays of shape (n,), n waveforms, all pixels of a shot before the next shot.
     lines: LinesOfSight
-    shots: int
-    beam_width: float
-    pulse_ns: float
+    shots: int  #: Number of shots.
+    beam_width: float  #: Diameter of the beam at e^-1/2 of its peak, or of the view if that is smaller, on the sea [m].
+    pulse_ns: float  #: Full width of an ideal echo at half maximum [ns].
+    #: Indices of the water.
     refractive_index: float
     group_index: float
-    slope: float
-    height: float
-    slope_variance: float
-    gain: float
+    slope: float  #: Standard deviation of the slopes averaged over a pixel [1], 0 for a level sea with ripples.
+    height: float  #: Standard deviation of the sea's height [m].
+    slope_variance: float  #: Variance of all slopes [1].
+    gain: float  #: Power of the column at the surface per backscattering coefficient [W m], NaN if unknown.
+    #: Width of the bins in which light was recorded before pulse and response [ns], 0 if it was not rendered.
     bin_ns: float
 
     @classmethod

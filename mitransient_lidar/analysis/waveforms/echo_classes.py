@@ -56,23 +56,12 @@ class Detection(NamedTuple):
 
 @dataclass(frozen=True)
 class Decision:
-    """Echoes of n records whose first echoes are decided upon.
+    """Echoes of n records whose first echoes are decided upon."""
 
-    Attributes
-    ----------
-    found
-        The echoes; land, and bottoms without a surface, are the last ones.
-    above
-        Which of them stand above the water, shape (echoes, n).
-    probability
-        That of the class of the first echo, shape (n,); 1 where echoes are apart.
-    rows, first
-        Records whose first echo is land, or a bottom near its surface, and what is decided of them.
-    """
-
-    found: DetectedEchoes
-    above: BoolArray
-    probability: FloatArray
+    found: DetectedEchoes  #: The echoes; land, and bottoms without a surface, are the last ones.
+    above: BoolArray  #: Which of them stand above the water, shape (echoes, n).
+    probability: FloatArray  #: That of the class of the first echo, shape (n,); 1 where echoes are apart.
+    #: Records whose first echo is land, or a bottom near its surface, and what is decided of them.
     rows: IntArray
     first: FirstEchoes | None = None
 

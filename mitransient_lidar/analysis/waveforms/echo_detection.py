@@ -67,24 +67,13 @@ def has_echo(flags: IntArray) -> BoolArray:
 
 @dataclass(frozen=True)
 class Records:
-    """Waveforms with their noise.
+    """Waveforms with their noise."""
 
-    Attributes
-    ----------
-    power
-        Samples less the baseline, shape (n, time); any unit, W for energies in J.
-    time_ns
-        Centres of the bins [ns], evenly spaced, shape (time,).
-    noise
-        Standard deviation of each sample, independent between bins, shape (n, time) or (n, 1).
-    shared
-        Correlation of the samples, and the inflation of their noise to that of means over neighbours, where sums of
-        samples are not those of independent bins. None otherwise.
-    """
-
-    power: FloatArray
-    time_ns: FloatArray
-    noise: FloatArray
+    power: FloatArray  #: Samples less the baseline, shape (n, time); any unit, W for energies in J.
+    time_ns: FloatArray  #: Centres of the bins [ns], evenly spaced, shape (time,).
+    noise: FloatArray  #: Standard deviation of each sample, independent between bins, shape (n, time) or (n, 1).
+    #: Correlation of the samples, and the inflation of their noise to that of means over neighbours, where sums of
+    #: samples are not those of independent bins. None otherwise.
     shared: BlockCorrelation | None = None
 
     @classmethod

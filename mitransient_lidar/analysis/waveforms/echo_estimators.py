@@ -29,28 +29,20 @@ _ENERGY_REACH = 1.5  # half the window of an energy, in echo widths
 
 @dataclass(frozen=True)
 class Window:
-    """Samples around one echo of each record, less the surrounding signal.
+    """Samples around one echo of each record, less the surrounding signal."""
 
-    Attributes
-    ----------
-    u, middle
-        Times from the middle bin of the echo [ns], shape (bins,), and times of the middle bins [ns], shape (n,).
-    power, noise, inside
-        Samples, their standard deviations, and whether they are inside the record; shape (n, bins).
-    ramps, level_noise
-        Weights of the levels before and after the echo in each sample, shape (2, bins), and their errors, shape (n, 2).
-    places, shared
-        Bins of the samples, shape (n, bins), and the correlation of their noise as of `Records`.
-    """
-
+    #: Times from the middle bin of the echo [ns], shape (bins,), and times of the middle bins [ns], shape (n,).
     u: FloatArray
     middle: FloatArray
+    #: Samples, their standard deviations, and whether they are inside the record; shape (n, bins).
     power: FloatArray
     noise: FloatArray
     inside: BoolArray
     bin_ns: float
+    #: Weights of the levels before and after the echo in each sample, shape (2, bins), and their errors, shape (n, 2).
     ramps: FloatArray
     level_noise: FloatArray
+    #: Bins of the samples, shape (n, bins), and the correlation of their noise as of `Records`.
     places: IntArray
     shared: BlockCorrelation | None
 

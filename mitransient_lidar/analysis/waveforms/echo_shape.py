@@ -95,18 +95,12 @@ class Template:
 
 @dataclass(frozen=True)
 class EchoShape:
-    """A template as a sum of Gaussians of one width, whose blurred form is of the same kind.
+    """A template as a sum of Gaussians of one width, whose blurred form is of the same kind."""
 
-    Attributes
-    ----------
-    delays, heights
-        Times of the Gaussians from the arrival [ns], and their heights, shape (terms,); the sum is 1 at the peak.
-    sigma, fwhm_ns, peak_ns
-        Standard deviation of the Gaussians, full width at half maximum of the sum, and time of its peak [ns].
-    """
-
+    #: Times of the Gaussians from the arrival [ns], and their heights, shape (terms,); the sum is 1 at the peak.
     delays: FloatArray
     heights: FloatArray
+    #: Standard deviation of the Gaussians, full width at half maximum of the sum, and time of its peak [ns].
     sigma: float
     fwhm_ns: float
     peak_ns: float
@@ -178,21 +172,13 @@ class EchoShape:
 
 @dataclass(frozen=True)
 class BlurredPulse:
-    """A template that is blurred by Gaussians, and its integral over time, from tables.
+    """A template that is blurred by Gaussians, and its integral over time, from tables."""
 
-    Attributes
-    ----------
-    start_ns, step_ns
-        First time of the tables and their step [ns].
-    variances
-        Variances of the Gaussians [ns^2], ascending from 0, denser near it.
-    power, slope, integral
-        Shape with the area of the template, its derivative by time [1/ns] and its integral [ns]; shape (variances, n).
-    """
-
+    #: First time of the tables and their step [ns].
     start_ns: float
     step_ns: float
-    variances: FloatArray
+    variances: FloatArray  #: Variances of the Gaussians [ns^2], ascending from 0, denser near it.
+    #: Shape with the area of the template, its derivative by time [1/ns] and its integral [ns]; shape (variances, n).
     power: FloatArray
     slope: FloatArray
     integral: FloatArray

@@ -71,33 +71,18 @@ class FirstEchoes:
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known of n records before they are fitted.
+    """What is known of n records before they are fitted."""
 
-    Attributes
-    ----------
-    level
-        Time of the surface.
-    metres_per_ns, depth_per_ns
-        Height in air and depth in the water per time [m/ns], shape (n,).
-    least_column
-        Signal of the column of the clearest water at the surface [unit of the record], shape (n,); 0 where unknown.
-    decay
-        Typical rate of decay of a column [1/ns].
-    onset
-        Mean focusing of the column's light by waves.
-    opaque
-        Whether light of column and bottom is part of the surface's echo.
-    baseline_stderr
-        Standard error of weak steady signals above the level without light [unit of the record], shape (n,).
-    """
-
-    level: SurfaceLevel
+    level: SurfaceLevel  #: Time of the surface.
+    #: Height in air and depth in the water per time [m/ns], shape (n,).
     metres_per_ns: FloatArray
     depth_per_ns: FloatArray
+    #: Signal of the column of the clearest water at the surface [unit of the record], shape (n,); 0 where unknown.
     least_column: FloatArray
-    decay: float
-    onset: ColumnOnset
-    opaque: bool
+    decay: float  #: Typical rate of decay of a column [1/ns].
+    onset: ColumnOnset  #: Mean focusing of the column's light by waves.
+    opaque: bool  #: Whether light of column and bottom is part of the surface's echo.
+    #: Standard error of weak steady signals above the level without light [unit of the record], shape (n,).
     baseline_stderr: FloatArray
 
     def column(self, delay_ns: FloatArray, decay: FloatArray | float) -> tuple[FloatArray, FloatArray]:

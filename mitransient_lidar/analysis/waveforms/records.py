@@ -43,72 +43,47 @@ _LONGEST_ECHO = 4.0  # largest expected width of an echo, in pulse widths
 
 @dataclass(frozen=True)
 class Waveforms:
-    """Waveforms of a dataset with the quantities that their measurement needs.
+    """Waveforms of a dataset with the quantities that their measurement needs."""
 
-    Attributes
-    ----------
-    dims, shape, unit
-        Dimensions, their sizes and the unit of the variable.
-    samples
-        Its values, shape (count, time), with all pixels of a shot before the next shot; of a signal after a logarithm,
-        the voltages before it.
-    time_ns
-        Centres of the bins [ns], shape (time,).
-    baseline, noise
-        Level of each pixel without light, shape (pixels,), and standard deviation of its samples, shape (pixels, time)
-        or (pixels, 1), or of each waveform where it differs between shots, shape (count, time).
-    baseline_stderr
-        Standard error of weak steady signals above this level, by the level and by rounding, shape (pixels,).
-    saturated, saturation_level
-        Samples at a limit, of the shape of `samples`, and the least such sample.
-    kernel, template, echo_shape
-        Pulse and response in bins, and the shape of an ideal echo, also as a sum of Gaussians.
-    focusing, onset
-        Mean focusing of the column's light by waves, None where it is not known, and the onset of the column.
-    fading
-        How the column fades by absorption.
-    echo_fwhm_ns, quiet_until_ns
-        Expected width of an echo, and end of the part of the record without echoes [ns].
-    geometry
-        Lidar geometry on the axis.
-    lines
-        Lines of sight, of the pixels of every shot or of one for all shots, shape (pixels,).
-    event_height
-        Height that single events of the detector reach, shape (pixels,).
-    lowest_m, highest_m
-        Lowest point of the sea [m], negative, and its highest one; those of a rough sea where they are not known.
-    sensitivity, column_gain
-        Signal per power of steady light [unit/W], shape (pixels,), and power of a column at the surface per
-        backscattering coefficient [W m], 0 and NaN where they are not known.
-    shared
-        Correlation of the noise of samples as of `echo_detection.Records`, None where samples are independent.
-    """
-
+    #: Dimensions, their sizes and the unit of the variable.
     dims: tuple[str, ...]
     shape: tuple[int, ...]
     unit: str
+    #: Its values, shape (count, time), with all pixels of a shot before the next shot; of a signal after a logarithm,
+    #: the voltages before it.
     samples: npt.NDArray[Any]
-    time_ns: FloatArray
+    time_ns: FloatArray  #: Centres of the bins [ns], shape (time,).
+    #: Level of each pixel without light, shape (pixels,), and standard deviation of its samples, shape (pixels, time)
+    #: or (pixels, 1), or of each waveform where it differs between shots, shape (count, time).
     baseline: FloatArray
     noise: FloatArray
+    #: Standard error of weak steady signals above this level, by the level and by rounding, shape (pixels,).
     baseline_stderr: FloatArray
+    #: Samples at a limit, of the shape of `samples`, and the least such sample.
     saturated: npt.NDArray[np.bool_] | None
     saturation_level: float
+    #: Pulse and response in bins, and the shape of an ideal echo, also as a sum of Gaussians.
     kernel: tuple[int, FloatArray]
     template: Template
     echo_shape: EchoShape
+    #: Mean focusing of the column's light by waves, None where it is not known, and the onset of the column.
     focusing: Focusing | None
     onset: ColumnOnset
-    fading: Fading
+    fading: Fading  #: How the column fades by absorption.
+    #: Expected width of an echo, and end of the part of the record without echoes [ns].
     echo_fwhm_ns: float
     quiet_until_ns: float
-    geometry: LidarGeometry
-    lines: LinesOfSight
-    event_height: FloatArray
+    geometry: LidarGeometry  #: Lidar geometry on the axis.
+    lines: LinesOfSight  #: Lines of sight, of the pixels of every shot or of one for all shots, shape (pixels,).
+    event_height: FloatArray  #: Height that single events of the detector reach, shape (pixels,).
+    #: Lowest point of the sea [m], negative, and its highest one; those of a rough sea where they are not known.
     lowest_m: float
     highest_m: float
+    #: Signal per power of steady light [unit/W], shape (pixels,), and power of a column at the surface per
+    #: backscattering coefficient [W m], 0 and NaN where they are not known.
     sensitivity: FloatArray
     column_gain: float
+    #: Correlation of the noise of samples as of `echo_detection.Records`, None where samples are independent.
     shared: BlockCorrelation | None = None
 
     @property

@@ -129,20 +129,11 @@ _LARGEST = 1e12
 
 @dataclass(frozen=True, eq=False)
 class PlatformPoses:
-    """Positions and attitudes of a platform, one for each time.
+    """Positions and attitudes of a platform, one for each time."""
 
-    Parameters
-    ----------
-    time_s
-        Times [s], shape (n,).
-    position
-        Positions x (east), y (north), z (up) [m], shape (n, 3).
-    roll_deg, pitch_deg, yaw_deg
-        Attitudes [deg], shape (n,): right side down, nose up, and clockwise from north.
-    """
-
-    time_s: FloatArray
-    position: FloatArray
+    time_s: FloatArray  #: Times [s], shape (n,).
+    position: FloatArray  #: Positions x (east), y (north), z (up) [m], shape (n, 3).
+    #: Attitudes [deg], shape (n,): right side down, nose up, and clockwise from north.
     roll_deg: FloatArray
     pitch_deg: FloatArray
     yaw_deg: FloatArray
