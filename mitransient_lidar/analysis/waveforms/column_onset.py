@@ -1,4 +1,4 @@
-"""Onset of the water column's signal behind the surface: mean focusing of light by waves, and absorption."""
+"""Onset of the column signal after the surface: mean focusing by waves, and absorption."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Focusing:
 
 @dataclass(frozen=True)
 class Fading:
-    """How the signal of a column fades by the absorption of pure water alone, as it does in the near infrared."""
+    """How a column's signal fades by pure-water absorption alone, as in the near infrared."""
 
     rate: float  #: Least rate of decay [1/ns].
     clearest: float  #: Backscattering coefficient of the clearest sea water [1/m].
@@ -83,8 +83,8 @@ class Fading:
     def delay(self, energy: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what the light of an opaque column delays an echo that includes it, and its standard deviation [ns].
 
-        The column has a share of the light between that of the clearest water and that of turbid water of a
-        backscattering coefficient of 0.02 1/m, uniformly distributed, and is as late as it decays on average.
+        The column's share of the light is uniformly distributed between clearest water and turbid water that
+        backscatters 0.02 1/m. The column is as late as it decays on average.
 
         Parameters
         ----------

@@ -220,11 +220,11 @@ class Waveforms:
         return np.arange(self.count)[rows]
 
     def lines_of(self, rows: Rows) -> LinesOfSight:
-        """Return the lines of sight of some of the waveforms."""
+        """Return some waveforms' lines of sight."""
         return self.lines.at(self._numbers(rows) % self.lines.off_nadir.size)
 
     def latest_surface(self, rows: Rows) -> FloatArray:
-        """Return the latest times of the surface echo [ns], of the lowest point of the sea, shape (waveforms,).
+        """Return the latest surface echo times [ns], for the sea's lowest point, shape (waveforms,).
 
         Pixels without direct light have none.
         """
@@ -235,7 +235,7 @@ class Waveforms:
         return np.asarray(lines.surface_time + np.where(dark, 0, trough + margin))
 
     def surface_level(self, rows: Rows) -> SurfaceLevel:
-        """Return the arrival of the mean sea level in some of the waveforms, with the waves about it."""
+        """Return the mean sea level's arrival in some waveforms, with the waves about it."""
         lines = self.lines_of(rows)
         per_metre = 1 / (0.5e-9 * C0 * np.cos(lines.off_nadir))
         waves = (self.highest_m - self.lowest_m) / HEIGHTS
@@ -264,7 +264,7 @@ class Waveforms:
         return spreading * self.focusing.at(lines.depth_of_time(np.broadcast_to(self.time_ns, spreading.shape)))
 
     def saturated_samples(self, rows: Rows, records: Records) -> npt.NDArray[np.bool_]:
-        """Return which samples of some of the waveforms are saturated, shape (waveforms, time)."""
+        """Return which samples are saturated in some waveforms, shape (waveforms, time)."""
         baseline = self.baseline[self._numbers(rows) % self.baseline.size, np.newaxis]
         high: npt.NDArray[np.bool_] = records.power + baseline >= self.saturation_level
         return high if self.saturated is None else high | self.saturated[rows]
@@ -330,7 +330,7 @@ def _receiver_response(dataset: xr.Dataset, step: float) -> Response | None:
 
 
 def _lines_of_sight(dataset: xr.Dataset, dims: tuple[str, ...]) -> LinesOfSight:
-    """Return the lines of sight of the waveforms, once for all shots if they share them."""
+    """Return the waveforms' lines of sight, once for all shots if they share them."""
     moves = any("shot" in dataset[name].dims for name in ("surface_time", "angle_x") if name in dataset.coords)
     return LinesOfSight.from_dataset(dataset, dims if moves else tuple(dim for dim in dims if dim != "shot"))
 
@@ -360,7 +360,7 @@ def _expanded(dataset: xr.Dataset, logarithm: LogAmplifier) -> xr.Dataset:
 
 
 def _echo_width(dataset: xr.Dataset, template: Template, ns_per_mrad: float) -> float:
-    """Return the width [ns] of an echo of the level sea over the footprint of the beam or of the field of view."""
+    """Return a level sea's echo width [ns] over the footprint of beam or field of view."""
     sigma = 0.5 * float(dataset.attrs.get("divergence_mrad", 0.0))
     if field := float(dataset.attrs.get("field_of_view_mrad", 0.0)):
         sigma = min(sigma, 0.25 * field)
@@ -378,7 +378,7 @@ def _noise(
     noise: float | npt.ArrayLike | None,
     run: int,
 ) -> FloatArray:
-    """Return the noise for means of `run` samples, of the shapes of `Waveforms.noise`."""
+    """Return the noise for means of `run` samples, shaped as `Waveforms.noise`."""
     pixels, count = baseline.size, samples.shape[1]
     if noise is not None:
         given = np.asarray(noise, dtype=np.float64)
@@ -401,7 +401,7 @@ def _noise(
 def _noise_of_render(
     dataset: xr.Dataset, deviation: FloatArray, run: int
 ) -> tuple[FloatArray, BlockCorrelation | None]:
-    """Return the noise for means of `run` samples of a render with the errors `deviation`, and its correlation."""
+    """Return the noise for means of `run` render samples with the errors `deviation`, and its correlation."""
     errors = SumErrors.of(dataset)
     if errors is None:
         return deviation, None
@@ -417,7 +417,7 @@ def _receiver_noise(
     quiet: npt.NDArray[np.bool_],
     run: int,
 ) -> FloatArray:
-    """Return the noise of the receiver's signal for means of `run` samples."""
+    """Return the receiver signal's noise for means of `run` samples."""
     pixels, count = baseline.size, samples.shape[1]
     if "block_level" in dataset:  # noise alone is hardly stored
         stated, mean = (dataset[key].values.reshape(-1, count) for key in ("signal_deviation", "signal_mean"))
@@ -469,7 +469,7 @@ def _block_levels(dataset: xr.Dataset, pixels: int) -> tuple[FloatArray, FloatAr
 
 
 def _inflation(rest: FloatArray, run: int) -> float:
-    """Return the standard deviation of means of `run` neighbouring samples over that of independent samples.
+    """Return the standard deviation ratio for means of `run` samples, neighbouring to independent.
 
     NaN are missing samples.
     """
