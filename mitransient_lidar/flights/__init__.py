@@ -1,1 +1,1 @@
-"""Flights: pulses along a trajectory, the places of their echoes, and files of points and waveforms."""
+"""Flights: pulses along a trajectory, echo positions, and files with points and waveforms."""

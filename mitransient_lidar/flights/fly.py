@@ -55,16 +55,16 @@ def fly(
     Parameters
     ----------
     flight
-        A TOML file, the name of a shipped flight, or a dict of its contents; see docs/guide/flights.md.
+        A TOML file, a shipped flight's name, or a dict with its contents; see docs/guide/flights.md.
     folder
-        Folder of the files: the store ``flight.zarr``, ``points.laz``, ``waveforms.las`` and ``waveforms.wdp``, and
-        the store ``infrared.zarr`` of an infrared channel with lines of its own.
+        Folder for the files: the store ``flight.zarr``, ``points.laz``, ``waveforms.las`` and ``waveforms.wdp``. An
+        infrared channel with its own lines has the store ``infrared.zarr``.
     light
         As of `rendering.shots.series.render_shots`; pulses near targets are merged.
     workers, scheduler
         As for `campaigns.sweep.campaign`.
     shard_size
-        Pulses of a shard, which one process renders and writes, 1 to 10^6; by default an eighth of them, but 512 to
+        Pulses per shard, which one process renders and writes, 1 to 10^6. Defaults to an eighth of all, but 512 to
         1024. The bits depend on it.
     progress
         Called with a `rendering.passes.Progress` about every second.

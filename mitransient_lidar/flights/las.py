@@ -46,19 +46,19 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
     path : path-like
         File, .las or .laz.
     points : xr.Dataset or iterable of xr.Dataset
-        Points of the flight, or chunks of them, of which one is in memory at a time. Variables over ``point``:
+        Points of the flight, or chunks, one in memory at a time. Variables over ``point``:
 
         - ``x``, ``y``, ``z``: coordinates [m] in `crs`;
-        - ``gps_time``: time of the pulse [s]; its attribute ``time_system``, of `poses.records.TIME_SYSTEMS`, is
-          ``flight`` by default. Those since 1980 become adjusted standard GPS times;
+        - ``gps_time``: pulse time [s]; its attribute ``time_system``, from `poses.records.TIME_SYSTEMS`, is ``flight``
+          by default. Those since 1980 become adjusted standard GPS times;
         - ``kind``: class, 0 to 255: 1 an object above the water, 2 land, 40 bottom, 41 water surface, 43 submerged
-          object, 45 no bottom found. The last is flagged as synthetic, since no echo is there. The
-          attribute ``object_class``, 46 or 64, is the class that files have in place of 43, of submerged vegetation;
+          object, 45 no bottom found. The last is flagged as synthetic, since no echo is there. The attribute
+          ``object_class``, 46 or 64, replaces class 43, submerged vegetation, in files;
         - ``intensity``: amplitude, with the attributes ``full_scale``, which becomes 65535, and ``units``; larger ones
           are clipped, negative and missing ones are 0. The scale is that of the first chunk;
         - ``channel``: scanner channel, 0 to 3: the pixel, or a group of pixels where more than four are;
         - ``return_number``, ``number_of_returns``: 1 to 15, of a pulse in a channel;
-        - ``scan_angle_deg``: angle of the pulse from nadir, -180 to 180, positive to the right of the heading;
+        - ``scan_angle_deg``: pulse angle from nadir, -180 to 180, positive right of the heading;
         - ``line``: number of the flight line, 0 to 65535;
         - ``transmitter``, the user data: 0 green, also if it is missing, 1 the infrared channel;
         - ``pixel``, 0 to 65535, and ``shot``, 0 to 2^32 - 1;
@@ -76,7 +76,7 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
     Raises
     ------
     UserError
-        If the suffix or the coordinate system is unknown or unsuitable, there is no point or more than 2^32 - 1, a
+        If the suffix or coordinate system is unknown or unsuitable, or there is no point or more than 2^32 - 1. If a
         coordinate is not finite or farther than 2147 km from the first point, or another value is out of range.
     WriteError
         If the operating system reports an error.
@@ -90,7 +90,7 @@ def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None =
 
 
 def write_waveforms(path: str | os.PathLike[str], points: Chunks, waveforms: Chunks, crs: str | None = None) -> int:
-    """Write points in format 9 of LAS 1.4, uncompressed, and beside it their waveforms in a file of suffix .wdp.
+    """Write points in LAS 1.4 format 9, uncompressed, and their waveforms beside it in a .wdp file.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def write_waveforms(path: str | os.PathLike[str], points: Chunks, waveforms: Chu
 
 
 def read_las(path: Path) -> xr.Dataset:
-    """Return coordinates [m], class and stated vertical error [m], if known, of the points of a LAS or LAZ file.
+    """Return a LAS or LAZ file's coordinates [m], classes and, if known, stated vertical errors [m].
 
     Variables over ``point``: ``x``, ``y``, ``z``, ``kind``, and ``vertical_uncertainty``.
     """
@@ -173,7 +173,7 @@ def _place(first: xr.Dataset) -> tuple[float, float]:
 
 
 def _time_system(first: xr.Dataset) -> str:
-    """Return the system of the times of points."""
+    """Return the points' time system."""
     return str(first["gps_time"].attrs.get("time_system", "flight"))
 
 
@@ -193,9 +193,9 @@ def _notes(first: xr.Dataset) -> str:
         f"Class 1 object above the water, 2 land, 40 bottom, 41 water surface, {of_object} submerged {objects}, "
         "45 no bottom found (flagged synthetic: "
         "no echo is there). User data: 0 green, 1 infrared channel. "
-        "The scanner channel is the pixel, or one of four groups of more pixels. "
+        "The scanner channel is the pixel, or one of four pixel groups. "
         "Return numbers count the echoes of a pulse in one channel; the fifteenth may be several. "
-        "Quality: 1 saturated, 2 poor fit, 4 corrected depth, 8 beyond the table of corrections, "
+        "Quality: 1 saturated, 2 poor fit, 4 corrected depth, 8 beyond the correction table, "
         "16 surface and bottom merged, 32 above the water, 64 class below 90 % probable, 128 surface from infrared. "
         "Points of saturated echoes and poor fits are withheld. "
         "Depths and uncertainties (1 sigma) are NaN where unknown."
@@ -203,7 +203,7 @@ def _notes(first: xr.Dataset) -> str:
 
 
 def _write(path: Path, header: laspy.LasHeader, chunks: Iterable[tuple[xr.Dataset, dict[str, Any]]]) -> int:
-    """Write chunks of points with their fields of waveforms."""
+    """Write chunks of points with their waveform fields."""
     import laspy
 
     compression = {"do_compress": path.suffix.lower() == ".laz", "laz_backend": laspy.LazBackend.Lazrs}
@@ -237,7 +237,7 @@ class _RawFile(io.FileIO):
 
 @contextlib.contextmanager
 def _written(path: Path) -> Iterator[IO[bytes]]:
-    """Open a new file; an error of a write is raised as it was, of which lazrs would say only that there was one."""
+    """Open a new file; write errors are raised as they were; lazrs alone would hide their kind."""
     raw = _RawFile(path, "wb")
     try:
         with io.BufferedWriter(raw) as file:
@@ -247,7 +247,7 @@ def _written(path: Path) -> Iterator[IO[bytes]]:
 
 
 def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float) -> dict[str, npt.NDArray[Any]]:
-    """Return the values of a chunk by laspy's names of fields."""
+    """Return a chunk's values by laspy's field names."""
     returns = _whole(points, "number_of_returns", 1, MOST_RETURNS)
     number = _whole(points, "return_number", 1, MOST_RETURNS)
     if np.any(number > returns):

@@ -1,4 +1,4 @@
-"""Header of a LAS 1.4 file: coordinate system, extra bytes and notes, as records of the specification."""
+"""LAS 1.4 header: coordinate system, extra bytes and notes, as records that the specification names."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _NO_DATA = 1  # bit of the options: the value for missing data is relevant
 
 
 class ExtraBytes(NamedTuple):
-    """One attribute of a point beyond those of its format."""
+    """One point attribute beyond the point format."""
 
     name: str
     dtype: str  #: Type in NumPy's notation.
@@ -59,13 +59,13 @@ EXTRA_BYTES = (
 
 
 def coordinate_system_wkt(crs: str | None, place: tuple[float, float] | None = None) -> str:
-    """Return a coordinate system as the WKT of OGC's specification of 2001, which LAS 1.4 asks for.
+    """Return a coordinate system as WKT by OGC's specification (2001), which LAS 1.4 needs.
 
     Parameters
     ----------
     crs : str or None
-        What pyproj understands: a code such as 'EPSG:32633' or 'EPSG:32633+5773' (with heights), a WKT. None: the frame
-        of the scene, an engineering system in metres with x east, y north, z up.
+        What pyproj understands: a code such as 'EPSG:32633' or 'EPSG:32633+5773' (with heights), a WKT. None: the scene
+        frame, an engineering system in metres with x east, y north, z up.
     place : (float, float), optional
         Point x, y [m] at which its metres must be those on the ground.
 
@@ -88,7 +88,7 @@ def coordinate_system_wkt(crs: str | None, place: tuple[float, float] | None = N
 
 
 def check_same_system(crs: str, epsg: int) -> None:
-    """Raise `UserError` if positions are not in the horizontal part of a system of `coordinate_system_wkt`."""
+    """Raise `UserError` if positions are not in the horizontal part of a `coordinate_system_wkt` system."""
     import pyproj
 
     whole = pyproj.CRS.from_user_input(crs)
@@ -106,22 +106,22 @@ def las_header(
     *,
     time_system: str = "flight",
 ) -> laspy.LasHeader:
-    """Return the header of a file of LAS 1.4.
+    """Return a LAS 1.4 header.
 
     Parameters
     ----------
     point_format : int
         6, or 9 with waveforms in an external file.
     first : tuple of float
-        Coordinates x, y of the first point [m]; offsets are whole kilometres near it, and 0 for z.
+        First point's coordinates x, y [m]; offsets are whole kilometres near it, and 0 for z.
     wkt : str
         Coordinate system.
     notes : str
         Text for the reader, as Text Area Description.
     descriptor : bytes
-        Waveform Packet Descriptor of format 9.
+        Waveform Packet Descriptor for format 9.
     time_system : str
-        System of the times of the pulses, of `TIME_NOTES`.
+        Pulse time system, from `TIME_NOTES`.
     """
     import laspy
     from laspy.header import GpsTimeType
@@ -151,7 +151,7 @@ def las_header(
 
 
 def is_simulated(path: Path) -> bool:
-    """Return whether a LAS or LAZ file, or that of a file of waveforms, has a header of `las_header`."""
+    """Return whether a LAS or LAZ file, perhaps beside a waveform file, has a `las_header` header."""
     points = path.with_suffix(".las") if path.suffix == ".wdp" else path
     if not points.is_file():
         return False

@@ -1,4 +1,4 @@
-"""Plan of a flight: platform, scanner, pulses, instrument, scene, and what is made of the records."""
+"""Flight plan: platform, scanner, pulses, instrument, scene, and products of the records."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Pulses(Plan):
 
 @dataclass(frozen=True)
 class InfraredLines(Plan):
-    """Pulses of an infrared channel that has a scanner of its own."""
+    """Pulses of an infrared channel with its own scanner."""
 
     scanner: Annotated[Mapping[str, Any], Option("Scanner, as of poses.scanner")]
     pulses: Annotated[Pulses, Option("Pulses")]
@@ -63,7 +63,7 @@ class InfraredLines(Plan):
 
 @dataclass(frozen=True)
 class FlightReceiver(Plan):
-    """Receiver of a flight, as of `analysis.receiver.detect_waveforms`, None for that of the instrument."""
+    """Flight receiver, as for `analysis.receiver.detect_waveforms`; None for the instrument's."""
 
     chain: Annotated[str | None, Option("Name of a receiver, or a TOML file", form="a name or a path")] = None
     gain: Annotated[Setting | None, Option("Factor of the gain; auto is chosen once for the flight", 0, above=True)] = (
@@ -173,7 +173,7 @@ class FlightPlan(Plan):
 
     @classmethod
     def of_file(cls, given: Mapping[str, Any], folder: Path | None = None) -> FlightPlan:
-        """Check a flight given as a dict of the contents of its file; raise `UserError` if it is invalid."""
+        """Check a flight, a dict with its file's contents; raise `UserError` if it is invalid."""
         folder = Path.cwd() if folder is None else folder
         receiver = given.get("receiver", {})
         if isinstance(receiver, Mapping) and "chain" in receiver:
@@ -200,7 +200,7 @@ class FlightPlan(Plan):
         return cls.of_file(json.loads(text))
 
     def poses(self) -> PulsePoses:
-        """Return the lines of sight of all pulses that are rendered, in the frame of the scene.
+        """Return the lines of sight of all rendered pulses, in the scene frame.
 
         Raises
         ------
@@ -220,7 +220,7 @@ class FlightPlan(Plan):
         return pulse_poses(trajectory, self.mounting, Scanner.of_table(self.scanner), times)
 
     def time_system(self, times: FloatArray) -> str:
-        """Return the system of the times [s] of the pulses, as of `records.time_system`."""
+        """Return the time system of the pulses, as from `records.time_system`."""
         return self._platform.time_system(times)
 
     @cached_property
@@ -243,7 +243,7 @@ class FlightPlan(Plan):
         return None if code is None else map_system("crs", code)
 
     def _check_coordinates(self) -> None:
-        """Raise `UserError` if the coordinates of a platform are not those of the points."""
+        """Raise `UserError` if platform and points have different coordinates."""
         platform, wanted = self._platform, self.stated_origin
         if self.crs is not None and isinstance(platform, SbetFile):
             check_same_system(self.crs, platform.epsg)

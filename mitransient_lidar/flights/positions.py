@@ -1,4 +1,4 @@
-"""Points of echoes: from poses of pulses and times of echoes to coordinates with standard deviations."""
+"""Echo points: from pulse poses and echo times to coordinates with standard deviations."""
 
 from __future__ import annotations
 
@@ -54,24 +54,24 @@ def positions(
     Parameters
     ----------
     echoes
-        Echoes of `echo_table.extract` with one estimator and depths from the surface echo, corrected by
-        `depth_correction.correct_depths` or not; over ``shot`` and ``pixel``, or ``row`` and ``column``.
+        Echoes from `echo_table.extract` with one estimator and depths from the surface echo, corrected by
+        `depth_correction.correct_depths` or not. Over ``shot`` and ``pixel``, or ``row`` and ``column``.
     poses
-        Poses of the pulses, with arrays of shape (shots, 3).
+        Pulse poses, with arrays of shape (shots, 3).
     angle_x, angle_y
         Tangent-plane angles of the pixels' lines of sight [rad], +angle_y to the left; they broadcast to (shots,
         pixels). Those of results are ``sight_x`` and ``sight_y``.
     refractive_index, group_index
         Indices of the water, 1 to 2 and 1 to 3.
     surface
-        The sea; by default, level at z = 0, with the slopes that the attributes of the echoes state.
+        The sea; by default, level at z = 0, with the slopes in the echoes' attributes.
     errors
-        Standard deviations of the poses; by default those of `PoseErrors`.
+        Pose standard deviations; by default `PoseErrors`.
     forward
-        Forward axis of the platform, not vertical, shape (3,) or (shots, 3). Needed where roll and pitch have different
+        Platform's forward axis, not vertical, shape (3,) or (shots, 3). Needed where roll and pitch have different
         errors.
     view_x, view_y
-        Standard deviations of the light in a pixel about its line of sight [rad], at least 0; they broadcast to (shots,
+        Standard deviations of a pixel's light about its line of sight [rad], at least 0; they broadcast to (shots,
         pixels).
     time_s
         Times of the pulses [s], shape (shots,). A surface with planes needs them.
@@ -85,24 +85,22 @@ def positions(
         sum of the variances of x and y) and ``depth_uncertainty`` [m], ``shot``, ``pixel``, ``return_number``,
         ``number_of_returns``, ``flags``, ``echo`` (its place in `ECHOES`, -1 without an echo) and, with `time_s`,
         ``gps_time`` [s]. Land and objects above the water are timed in air: their depth is negative. A waveform without
-        an echo has one point of the class 45, where its line of sight meets the sea, with NaN as depth and intensity.
+        an echo has one point in class 45, where its line of sight meets the sea, with NaN as depth and intensity.
 
     Raises
     ------
     UserError
-        If shapes do not agree, a pose is not orthonormal, a line of sight does not descend to the sea, a value is out
-        of range, or the echoes lack a variable, have several estimators or depths from the mean sea level.
+        If shapes do not agree, a pose is not orthonormal, a line of sight does not descend to the sea, or a value is
+        out of range. If the echoes lack a variable, have several estimators, or depths from the mean sea level.
 
     Notes
     -----
-    A point is at o + R d + s w, as of `RefractedPaths`: R is the range of the surface's arrival in the pixel, from
-    which depths are counted, or with planes that of the plane. Over a level sea its z is that of the surface less the
-    depth.
+    A point is at o + R d + s w, as of `RefractedPaths`: R is the range of the pixel's surface arrival, from which
+    depths count, or with planes the plane's range. Over a level sea its z is that of the surface less the depth.
 
-    Errors are propagated to first order and are independent of each other: position, attitude and range of the lidar;
-    arrivals of surface and echo; the method error of the depth; height and slopes of the surface; and the place in the
-    pixel from which the light comes. The method error of the depth includes what the arrival of the surface and its
-    slopes contribute, so that only the rest of it counts beside them.
+    Errors are propagated to first order and are independent: position, attitude and range of the lidar; arrivals of
+    surface and echo; the depth's method error; surface height and slopes; and the light's place in the pixel. The
+    depth's method error includes the parts by surface arrival and slopes, so that only its rest counts beside them.
     """
     table = _Table.of(echoes)
     errors = PoseErrors() if errors is None else errors
@@ -176,7 +174,7 @@ def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0)
     Parameters
     ----------
     points
-        Points of `positions`, of the whole flight; with planes they need ``gps_time``.
+        Points from `positions` over the whole flight; with planes they need ``gps_time``.
     slope_deviation, radius
         As for `SurfaceModel.fit`.
 
@@ -195,7 +193,7 @@ def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0)
 
 
 def _checked(poses: Pose, shots: int) -> Pose:
-    """Return the poses of pulses, of vectors of shape (shots, 1, 3), or refuse them."""
+    """Return pulse poses with vectors of shape (shots, 1, 3), or refuse them."""
     vectors = {name: finite_array(name, getattr(poses, name)) for name in ("origin", "axis", "far", "left")}
     for name, value in vectors.items():
         if value.shape != (shots, 3):
@@ -210,7 +208,7 @@ def _checked(poses: Pose, shots: int) -> Pose:
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """Echoes: values of surface, target and bottom, shape (shots, pixels, 3), or of the surface, (shots, pixels)."""
+    """Echoes: surface, target and bottom values, shape (shots, pixels, 3), or the surface's, (shots, pixels)."""
 
     values: dict[str, FloatArray]
     shape: tuple[int, int]
@@ -241,7 +239,7 @@ class _Table:
         return cls({name: value.reshape(*shape, *last[name]) for name, value in values.items()}, shape)
 
     def points(self) -> tuple[IntArray, IntArray, IntArray]:
-        """Return shot, pixel and echo of all points, in order; the echo of a waveform without one is -1."""
+        """Return shot, pixel and echo of all points, in order; a waveform without an echo has -1."""
         found = has_echo(self.values["flags"].astype(np.int64)) & np.isfinite(self.values["depth_m"])
         found &= np.isfinite(self.values["surface_time_ns"])[..., None]
         if "class" in self.values:
@@ -269,7 +267,7 @@ class _Table:
     def timing(self, shot: IntArray, pixel: IntArray, echo: IntArray, dry: BoolArray, cosine: FloatArray) -> Timing:
         """Return what the times of points mean; errors that are not known count as 0.
 
-        Of points that are `dry`, the range is their own; the cosine is that of their line of sight from the vertical.
+        `dry` points have their own range; the cosine belongs to their line of sight from the vertical.
         """
         surface = [_PER_NS * self.values[name][shot, pixel] for name in _OF_SURFACES]
         noise = _PER_NS * self.values["time_ns_stderr"][shot, pixel, echo]
@@ -283,7 +281,7 @@ class _Table:
 
 
 def _of_pixels(name: str, given: npt.ArrayLike, shape: tuple[int, int]) -> FloatArray:
-    """Return values for every pulse and pixel; an array of rows and columns counts as one of pixels."""
+    """Return values for every pulse and pixel; an array of rows and columns counts as pixels."""
     values = finite_array(name, given)
     if values.size == shape[1]:
         values = values.reshape(-1)
@@ -294,13 +292,13 @@ def _of_pixels(name: str, given: npt.ArrayLike, shape: tuple[int, int]) -> Float
 
 
 def _beam_width(echoes: xr.Dataset, ranges: FloatArray) -> float:
-    """Return the diameter of the beam, or of the view if that is smaller, on the sea [m]."""
+    """Return the beam diameter on the sea [m], or the view's if that is smaller."""
     widths = [optional_number(echoes.attrs, f"{name}_mrad") for name in ("divergence", "field_of_view")]
     return 1e-3 * float(np.median(ranges)) * min((one for one in widths if one is not None), default=0.0)
 
 
 def numbered_returns(shot: IntArray, pixel: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the number of each point among those of its shot and pixel, which follow each other, and how many."""
+    """Return point numbers within each shot and pixel, which follow each other, and their count."""
     starts = np.flatnonzero(np.r_[True, (np.diff(shot) != 0) | (np.diff(pixel) != 0)][: shot.size])
     counts = np.diff(np.r_[starts, shot.size])
     return np.arange(shot.size) - np.repeat(starts, counts) + 1, np.repeat(counts, counts)

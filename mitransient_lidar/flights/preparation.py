@@ -1,4 +1,4 @@
-"""What is known of a flight before its first render: groups of pulses, their records, coverage and places."""
+"""What is known about a flight before its first render: pulse groups, their records, coverage and places."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _MARGIN_NS = 15.0
 
 
 def input_columns(poses: PulsePoses) -> dict[str, Column]:
-    """Return the inputs of pulses but the start of their record, in groups of similar angles from nadir and heights."""
+    """Return the pulses' inputs but the record start, in groups with similar angles from nadir and heights."""
     if np.any(poses.axis[:, 2] >= -0.05):
         row = int(np.argmax(poses.axis[:, 2]))
         angle = np.degrees(np.arccos(-poses.axis[row, 2]))
@@ -94,7 +94,7 @@ def input_columns(poses: PulsePoses) -> dict[str, Column]:
 
 
 def pilot_rows(inputs: Mapping[str, Column], most: int) -> IntArray:
-    """Return the rows of pilot pulses, spread over the groups and the angles from nadir of a flight's pulses.
+    """Return pilot pulses' rows, spread over the groups and angles from nadir in a flight.
 
     So those of flights with the same scanner and height look alike, however many pulses they have.
     """
@@ -105,7 +105,7 @@ def pilot_rows(inputs: Mapping[str, Column], most: int) -> IntArray:
 
 
 def axis_of(plan: FlightPlan, source: SceneSource, inputs: Mapping[str, Column]) -> tuple[TimeAxis, int]:
-    """Return time bins that hold the light of pulses of one group, relative to the lidar of the group.
+    """Return time bins that contain the light for one group's pulses, relative to the group's lidar.
 
     The number is that of pulses which meet the bottom beyond its height map.
 
@@ -191,13 +191,13 @@ def check_maps(plan: FlightPlan, scene: mi.Scene) -> None:
 
 
 def beyond_angles(angle_deg: FloatArray, table: xr.Dataset) -> BoolArray:
-    """Return which angles from nadir [deg] are outside those of a table of corrections by more than half of a group."""
+    """Return which angles from nadir [deg] lie outside a correction table by more than half a group."""
     low, high = (float(table["off_nadir_deg"][end]) for end in (0, -1))
     return np.asarray((angle_deg < low - _ANGLES / 2) | (angle_deg > high + _ANGLES / 2))
 
 
 def warn_of_angles(angle_deg: FloatArray, table: xr.Dataset) -> None:
-    """Warn of pulses outside the angles from nadir of a table of corrections."""
+    """Warn about pulses outside a correction table's angles from nadir."""
     low, high = (float(table["off_nadir_deg"][end]) for end in (0, -1))
     if outside := np.count_nonzero(beyond_angles(angle_deg, table)):
         _LOG.warning(
@@ -208,7 +208,7 @@ def warn_of_angles(angle_deg: FloatArray, table: xr.Dataset) -> None:
 
 @contextlib.contextmanager
 def telling_errors_alone() -> Iterator[None]:
-    """Keep the package from telling of a scene what it has told of it before."""
+    """Keep the package from repeating messages about a scene."""
     logger = logging.getLogger("mitransient_lidar")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -219,7 +219,7 @@ def telling_errors_alone() -> Iterator[None]:
 
 
 def warn_of_maps(beyond: int, pulses: int) -> None:
-    """Warn of pulses beyond the height map of a bottom."""
+    """Warn about pulses beyond a bottom's height map."""
     if beyond:
         _LOG.warning(
             "%d of %d pulses meet the bottom beyond its height map, whose edge continues there", beyond, pulses
@@ -227,7 +227,7 @@ def warn_of_maps(beyond: int, pulses: int) -> None:
 
 
 def tell_forecast(saturated: int, sampled: int, is_automatic: bool, pulses: int, seconds: float) -> None:
-    """Log how many pilot pulses saturate, and the processor time of a flight by that of one of them [s]."""
+    """Log how many pilot pulses saturate, and a flight's processor time from one pilot's [s]."""
     share = 100 * saturated / sampled
     text = f"{saturated} of {sampled} pilot pulses saturate the receiver, {share:.0f} % of the flight"
     if saturated and not is_automatic:
@@ -238,20 +238,20 @@ def tell_forecast(saturated: int, sampled: int, is_automatic: bool, pulses: int,
 
 
 def lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]:
-    """Return the angle from nadir [deg], the height, and the place of the lidar of pulses of one group [m]."""
+    """Return angle from nadir [deg], height, and lidar place for one group's pulses [m]."""
     angle, height, x, y = (float(inputs[f"group_{name}"][0]) for name in ("angle_deg", "height", "x", "y"))
     return angle, height, x, y
 
 
 def shot_poses(lidar: LidarScene, inputs: Mapping[str, Column]) -> ShotPoses:
-    """Return the poses of pulses of one group."""
+    """Return one group's pulse poses."""
     from mitransient_lidar.rendering.shots.batches import ShotPoses
 
     return ShotPoses.of_receiver(lidar, poses_of(inputs.__getitem__))
 
 
 def _bands(values: FloatArray, step: float) -> IntArray:
-    """Return the numbers of bands of equal width, at most a step, into which values fall."""
+    """Return band numbers for values; bands are equally wide, at most a step."""
     low, high = float(values.min()), float(values.max())
     count = max(int(np.ceil((high - low) / step)), 1)
     return np.minimum(((values - low) / max((high - low) / count, 1e-12)).astype(np.int64), count - 1)

@@ -65,22 +65,14 @@ class Quality(IntFlag):
 
 @dataclass(frozen=True)
 class Flown:
-    """Pulses of a store that are rendered, in the order of their times.
+    """A store's rendered pulses, in time order."""
 
-    Attributes
-    ----------
-    store
-        The store.
-    rows
-        Their rows in it.
-    """
-
-    store: Store
-    rows: IntArray
+    store: Store  #: The store.
+    rows: IntArray  #: Their rows in it.
 
     @classmethod
     def of(cls, store: Store) -> Flown:
-        """Return the pulses of a store; raise `UserError` if none is rendered, or it is no flight of this version."""
+        """Return a store's pulses; raise `UserError` if none is rendered, or it is no flight of this version."""
         if store.kind != "flight":
             raise UserError(f"{store.path} is the store of a {store.kind}, not of a flight")
         if "echo_class" not in store.variables:
@@ -114,7 +106,7 @@ class Flown:
 
 
 def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
-    """Return the echoes of all pulses, with times after their pulse, and depths for the angle of each.
+    """Return all pulses' echoes, with times after their pulse, and depths for each angle.
 
     `flown`: the pulses. `corrections`: ``none``, ``auto`` or a file, as of `depth_correction.corrections_for`. With
     them there is ``beyond_table``: whether the angle of the pulse or the depth is outside the table.
@@ -164,15 +156,15 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
 
 
 def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
-    """Return the points of all echoes, in coordinates of the scene.
+    """Return all echoes' points, in scene coordinates.
 
-    Returns points of `positions.positions`, with ``scan_angle_deg``, ``line``, ``quality`` (sums of `Quality`) and
+    Returns points from `positions.positions`, with ``scan_angle_deg``, ``line``, ``quality`` (`Quality` sums) and
     ``withheld``, whether the echo is saturated or its fit poor; ``pseudo_reflectance``, ``optical_depth`` and
-    ``class_probability``; and the truth: ``true_z`` [m], the mean height of the surface in the beam or, for points
-    below it, that of the highest solid at x and y; ``true_target``, whether that solid is a target; and of the pulse
-    ``true_surface_height``, ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m]. The points of an
-    infrared channel with lines of its own follow, with the ``transmitter`` 1 and numbers of their own as ``shot``; the
-    surface is then that of both channels.
+    ``class_probability``; and the truth: ``true_z`` [m], the mean surface height in the beam or, for points below it,
+    the highest solid at x and y; ``true_target``, whether that solid is a target; and of the pulse
+    ``true_surface_height``, ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m]. Points from an infrared
+    channel with its own lines follow, with ``transmitter`` 1 and their own numbers as ``shot``; both channels then give
+    the surface.
     """
     infrared = None
     if plan.infrared_lines is not None:
@@ -215,10 +207,10 @@ def _joined(points: xr.Dataset, infrared: xr.Dataset) -> xr.Dataset:
 
 
 def read_points(path: Path) -> xr.Dataset:
-    """Return the points of a flight in a folder or store, or of a LAS or LAZ file.
+    """Return a flight's points in a folder or store, or a LAS or LAZ file's.
 
-    Those of a store are as of `points_of`. Those of a file have ``x``, ``y``, ``z`` [m], ``kind`` and, if the file has
-    it, ``vertical_uncertainty`` [m].
+    A store's points are as from `points_of`. Those of a file have ``x``, ``y``, ``z`` [m], ``kind`` and, if the file
+    has it, ``vertical_uncertainty`` [m].
 
     Raises UserError if nothing of these is there, or it has no points.
     """
@@ -269,10 +261,10 @@ def _quality(points: xr.Dataset, echoes: xr.Dataset, infrared: npt.NDArray[np.bo
 
 
 def _of_light(flown: Flown, points: xr.Dataset, echoes: xr.Dataset) -> dict[str, Any]:
-    """Return what the light of points says: reflectance, optical depth of the column above them, and probability.
+    """Return what the points' light states: reflectance, column optical depth above them, and probability.
 
-    The pseudo-reflectance is that of the lidar equation of a Lambertian plane across the beam in air, at the distance
-    of the point along the path: pi R^2 E / (E_0 eta A), with the energy E of the echo on the detector.
+    The pseudo-reflectance is pi R^2 E / (E_0 eta A), with the echo energy E on the detector. It solves the lidar
+    equation for a Lambertian plane across the beam in air, at the point's distance along the path.
     """
     attributes, kind = flown.attributes, points["kind"].values
     place = points["shot"].values, points["pixel"].values
@@ -300,7 +292,7 @@ def _of_light(flown: Flown, points: xr.Dataset, echoes: xr.Dataset) -> dict[str,
 
 
 def describe_points(points: xr.Dataset) -> list[str]:
-    """Return the lines of a table of points by class: numbers, and errors of their heights against the truth [cm]."""
+    """Return table lines for points by class: numbers, and height errors against the truth [cm]."""
     if "transmitter" in points:
         green, infrared = (points.isel(point=points["transmitter"].values == one) for one in (0, 1))
         names = [name for name in points if name != "transmitter"]
@@ -360,7 +352,7 @@ def _describe_pulses(points: xr.Dataset) -> list[str]:
 
 @alone
 def _truth(flown: Flown, plan: FlightPlan, points: xr.Dataset) -> dict[str, Any]:
-    """Return what is known of points: height of the sea in the beam or of the highest solid there, and of the pulse."""
+    """Return the truth about points: sea height in the beam or highest solid there, and pulse height."""
     from mitransient_lidar.loading.scenes import open_scene
     from mitransient_lidar.rendering.shots.truth import solids_below
     from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -400,8 +392,8 @@ def write_files(flown: Flown, plan: FlightPlan, points: xr.Dataset, folder: Path
 def with_channels(points: xr.Dataset, pixels: int) -> xr.Dataset:
     """Return points with the scanner channels and return numbers of LAS.
 
-    Up to four pixels are the channels, and more are four groups of neighbours, whose returns of a pulse are numbered
-    together from the highest on. Those after the fifteenth have its number.
+    Up to four pixels are the channels. More form four groups of neighbours; their returns from a pulse are numbered
+    together, highest first. Those after the fifteenth have its number.
     """
     pixel, shot = points["pixel"].values, points["shot"].values
     if pixels <= MOST_CHANNELS:
@@ -426,7 +418,7 @@ def _chunks(flown: Flown) -> Iterator[slice]:
 
 
 def _packets(flown: Flown) -> Iterator[xr.Dataset]:
-    """Return the samples of the pulses of each chunk, one packet a pixel."""
+    """Return each chunk's pulse samples, one packet a pixel."""
     signal = flown.values("signal")
     low, high = float(np.nanmin(signal)), float(np.nanmax(signal))
     width = float(flown.store.attributes["bin_width_ns"])
@@ -437,7 +429,7 @@ def _packets(flown: Flown) -> Iterator[xr.Dataset]:
 
 
 def _with_packets(flown: Flown, points: xr.Dataset) -> Iterator[xr.Dataset]:
-    """Return the points of each chunk, with their packets, the times in them, and the directions of light."""
+    """Return each chunk's points, with their packets, times in them, and light directions."""
     attributes, echoes = flown.attributes, echoes_of(flown)
     width = float(flown.store.attributes["bin_width_ns"])
     time = echoes["time_ns"].transpose("shot", "pixel", "echo").values
@@ -471,7 +463,7 @@ def _with_packets(flown: Flown, points: xr.Dataset) -> Iterator[xr.Dataset]:
 
 
 def _directions(flown: Flown, shot: IntArray, pixel: IntArray) -> FloatArray:
-    """Return the unit lines of sight of points, shape (points, 3)."""
+    """Return the points' unit lines of sight, shape (points, 3)."""
     angles = [1e-3 * flown.coordinate(name)[pixel] for name in ("sight_x", "sight_y")]
     return flown.poses.part(shot).directions(np.stack(angles, axis=1))
 

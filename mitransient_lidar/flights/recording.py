@@ -1,4 +1,4 @@
-"""Recording of rendered pulses: the receiver of a flight, whose automatic settings are chosen once for all pulses."""
+"""Recording rendered pulses: a flight's receiver, whose automatic settings are chosen once for all pulses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SETTINGS = {"receiver_gain_": "factor of the gain", "receiver_density_": "optica
 
 
 def record(series: xr.Dataset, plan: FlightPlan, inputs: Mapping[str, Column]) -> xr.Dataset:
-    """Return the record of pulses that are rendered together, as of `detect_waveforms`, with the settings in inputs.
+    """Return the record for pulses rendered together, as from `detect_waveforms`, with the settings in inputs.
 
     Channels whose settings the inputs do not hold choose them for these pulses alone.
     """
@@ -39,13 +39,13 @@ def record(series: xr.Dataset, plan: FlightPlan, inputs: Mapping[str, Column]) -
 
 
 def chosen_settings(pilots: xr.Dataset, plan: FlightPlan) -> dict[str, float]:
-    """Return the settings of automatic channels for rendered pilot pulses of a flight, as inputs of its pulses."""
+    """Return automatic channels' settings for a flight's rendered pilot pulses, as inputs of its pulses."""
     found = shared_settings(pilots, _receiver(pilots, plan), plan.receiver.background_power_w)
     return {f"{name}{number}": one for number, used in found.items() for name, one in zip(SETTINGS, used, strict=True)}
 
 
 def saturated_pulses(pilots: xr.Dataset, plan: FlightPlan, settings: Mapping[str, float]) -> int:
-    """Return how many of rendered pulses have saturated samples, with the settings of automatic channels."""
+    """Return how many rendered pulses have saturated samples, with the automatic channels' settings."""
     inputs = {"pulse": np.zeros(1, dtype=np.int64), **{name: np.array([value]) for name, value in settings.items()}}
     saturated = record(pilots, plan, inputs)["saturated"]
     return int(np.count_nonzero(saturated.any([dim for dim in saturated.dims if dim != "shot"])))
@@ -54,16 +54,16 @@ def saturated_pulses(pilots: xr.Dataset, plan: FlightPlan, settings: Mapping[str
 def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray, passes: IntArray) -> xr.DataArray:
     """Return standard errors that are at least those which neighbouring bins have.
 
-    A standard error of a few passes is itself uncertain by a third, and too small where none of the rare bright paths
-    came: such noise of a render would count as an echo. The variance of a sum of paths of like weights is in proportion
-    to its mean: the pooled variance of a bin is its power times the ratio of variance to power of 21 bins. Relative
-    errors rise behind an echo: pooled, they would raise that of its peak. Of 64 pulses of ``semi_arc`` and ``palmer``,
-    8 and 11 passes against renders to 2 %, the root mean square of error over pooled error is 1.26 and 0.98; with
-    pooled relative errors it would be 1.69 and 1.26.
+    A standard error from a few passes is itself uncertain by a third, and too small where no rare bright path came.
+    Such render noise would count as an echo. A sum of equally weighted paths has a variance in proportion to its mean.
+    So a bin's pooled variance is its power times the variance-to-power ratio over 21 bins. Relative errors rise behind
+    an echo: pooled, they would raise that of its peak. 64 pulses each in ``semi_arc`` and ``palmer``, 8 and 11 passes,
+    were compared with renders to 2 %. The rms ratio of error to pooled error is 1.26 and 0.98; with pooled relative
+    errors it would be 1.69 and 1.26.
 
     The error of two passes is hardly known, and twice too large at one bottom in twenty, which would be lost in it.
-    Where there are fewer than four passes, the relative error of the 21 bins is that of all such shots together, larger
-    beside their echo, and a bin's own error does not count.
+    With fewer than four passes, all such shots together give the relative error over the 21 bins, larger beside their
+    echo. A bin's own error then does not count.
 
     Parameters
     ----------
@@ -88,13 +88,13 @@ def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray, passes: IntArray
 
 
 def _receiver(series: xr.Dataset, plan: FlightPlan) -> ReceiverChannels:
-    """Return the receiver of a flight, with its settings, of which some may be automatic."""
+    """Return a flight's receiver with its settings; some may be automatic."""
     own = plan.receiver
     return receiver_of_result(series, own.chain, own.gain, own.optical_density)
 
 
 def _stored(inputs: Mapping[str, Column]) -> dict[int, tuple[float, float]]:
-    """Return gains and optical densities in the inputs of pulses, by the number of the channel."""
+    """Return gains and optical densities in the pulses' inputs, by channel number."""
     gain, density = SETTINGS
     numbers = [int(name.removeprefix(gain)) for name in inputs if name.startswith(gain)]
     return {number: (float(inputs[f"{gain}{number}"][0]), float(inputs[f"{density}{number}"][0])) for number in numbers}

@@ -1,4 +1,4 @@
-"""Paths of pulses through the sea surface to points in the water, and the propagation of errors to the points."""
+"""Pulse paths through the sea surface to points in the water, and error propagation to the points."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CLEARLY = 2.0
 
 @dataclass(frozen=True)
 class PoseErrors(Plan):
-    """Standard deviations of what a flight knows of its poses, by default typical of a survey after post-processing."""
+    """Standard deviations of a flight's known poses, by default typical for post-processed surveys."""
 
     roll_deg: Annotated[float, Option("Roll", 0, unit="deg")] = 0.0025
     pitch_deg: Annotated[float, Option("Pitch", 0, unit="deg")] = 0.0025
@@ -59,7 +59,7 @@ class PoseErrors(Plan):
 
 
 class Timing(NamedTuple):
-    """What the echoes of n points say, all in metres and of shape (n,)."""
+    """What n points' echoes state, all in metres with shape (n,)."""
 
     surface_range: FloatArray  #: Distance in air to the surface.
     surface_noise: FloatArray  #: Its standard error by noise.
@@ -73,37 +73,24 @@ class Timing(NamedTuple):
 class RefractedPaths:
     """Paths o + R d + s w of n points: a leg in air and, behind the surface, one in the water.
 
-    With the normal m of the surface, Snell's law is w = d/n + (c/n - c_w) m, where c = -d . m and
-    c_w^2 = 1 - (1 - c^2)/n^2. The length in the water is s = (T - R)/n_g with T = R_s + n_g D/cos(theta_w): R_s and D
-    are the range of the surface and the depth by the echoes, theta_w is the refracted angle of a level sea.
-
-    Attributes
-    ----------
-    direction, refracted
-        Unit directions d and w, shape (n, 3).
-    distance, length
-        R and s [m], shape (n,); s is 0 for points on the surface.
-    facets
-        Surface where the paths cross it.
-    in_water, on_model
-        Whether a point is in the water, and whether R is that of the facets instead of R_s.
-    origin
-        Position of the lidar o [m], shape (n, 3).
-    timing
-        What the echoes say.
-    index, group_index
-        Refractive and group index of the water.
+    With the normal m of the surface, Snell's law is w = d/n + (c/n - c_w) m, where c = -d . m and c_w^2 = 1 - (1 -
+    c^2)/n^2. The length in the water is s = (T - R)/n_g with T = R_s + n_g D/cos(theta_w): R_s and D are surface range
+    and depth by the echoes, theta_w is a level sea's refracted angle.
     """
 
-    origin: FloatArray
+    origin: FloatArray  #: Position of the lidar o [m], shape (n, 3).
+    #: Unit directions d and w, shape (n, 3).
     direction: FloatArray
     refracted: FloatArray
+    #: R and s [m], shape (n,); s is 0 for points on the surface.
     distance: FloatArray
     length: FloatArray
-    facets: Facets
+    facets: Facets  #: Surface where the paths cross it.
+    #: Whether a point is in the water, and whether R is that of the facets instead of R_s.
     in_water: BoolArray
     on_model: BoolArray
-    timing: Timing
+    timing: Timing  #: What the echoes say.
+    #: Refractive and group index of the water.
     index: float
     group_index: float
 
@@ -127,12 +114,12 @@ class RefractedPaths:
         timing
             What the echoes say.
         classes
-            Whether a point is in the water, and whether it is that of a pulse without an echo, shape (n,).
+            Whether a point is in the water, and whether its pulse has no echo, shape (n,).
         indices
             Refractive and group index.
         surface
-            The sea. Points in the water are behind its planes, if it has some, but behind R_s where it has less than
-            half of the error of the plane's height; those of pulses without an echo are on the surface.
+            The sea. Points in the water are beyond its planes, if it has some, but beyond R_s where its error is below
+            half the plane height's. Points from pulses without an echo are on the surface.
         time_s
             Times [s], shape (n,).
         """
@@ -167,13 +154,13 @@ class RefractedPaths:
         Parameters
         ----------
         errors
-            Standard deviations of the poses.
+            Pose standard deviations.
         rotations
-            Rotation vectors of roll, pitch and heading by one standard deviation [rad], shape (3, n, 3).
+            Rotation vectors for roll, pitch and heading by one standard deviation [rad], shape (3, n, 3).
         sides
-            Standard deviations of the light in the pixel about the line of sight as vectors [rad], shape (2, n, 3).
+            Standard deviations of pixel light about the line of sight as vectors [rad], shape (2, n, 3).
         slope_deviation
-            Standard deviation of the slopes that the method error of the depth includes [1].
+            Standard deviation of slopes in the depth's method error [1].
         """
         d, w, n = self.direction, self.refracted, self.index
         normal = np.column_stack([-self.facets.slope, np.ones(len(d))])
@@ -231,13 +218,13 @@ def _factor(direction: FloatArray, unit: FloatArray, n: float) -> FloatArray:
 
 
 def _bent(direction: FloatArray, normal: FloatArray, n: float, change: FloatArray) -> FloatArray:
-    """Return the change of the refracted direction by a change of the direction in air, both shape (N, 3)."""
+    """Return the refracted direction's change with the direction in air, both shape (N, 3)."""
     unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     return np.asarray(change / n - (_slope_of_factor(direction, unit, n) * _dot(change, unit))[:, None] * unit)
 
 
 def _tilted(direction: FloatArray, normal: FloatArray, n: float) -> list[FloatArray]:
-    """Return the derivatives of the refracted direction by the rises of the surface towards +x and +y, shape (N, 3)."""
+    """Return derivatives of the refracted direction by surface rises towards +x and +y, shape (N, 3)."""
     size = np.linalg.norm(normal, axis=1, keepdims=True)
     unit = normal / size
     factor = _factor(direction, unit, n)
@@ -251,6 +238,6 @@ def _tilted(direction: FloatArray, normal: FloatArray, n: float) -> list[FloatAr
 
 
 def _slope_of_factor(direction: FloatArray, unit: FloatArray, n: float) -> FloatArray:
-    """Return df/dc = (1 - c/(n c_w))/n of the factor f of `_factor`, shape (N,)."""
+    """Return df/dc = (1 - c/(n c_w))/n for `_factor`'s factor f, shape (N,)."""
     c = -_dot(direction, unit)
     return np.asarray((1 - c / (n * cos_in_water(c, n))) / n)

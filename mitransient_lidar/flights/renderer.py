@@ -1,4 +1,4 @@
-"""Rendering of the pulses of a flight: shots of similar poses together, recorded by the receiver, with their echoes."""
+"""Rendering a flight's pulses: shots with similar poses together, recorded by the receiver, with their echoes."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ _MAP_PASSES = 2
 
 @dataclass(frozen=True, eq=False)
 class FlightRenderer(Renderer):
-    """Renders the pulses of a flight, whose records begin at the times of their groups, all with as many time bins."""
+    """Renders a flight's pulses; records begin at their groups' times, all with as many time bins."""
 
     plan: FlightPlan
     plan_type, unit, kind = FlightPlan, "shot", "flight"
@@ -83,10 +83,10 @@ class FlightRenderer(Renderer):
     @classmethod
     @alone
     def of(cls, plan: FlightPlan, progress: ProgressCallback | None = None) -> tuple[FlightRenderer, dict[str, Column]]:
-        """Return the renderer of a new flight, and the inputs of its pulses, in groups; tell what is known before it.
+        """Return a new flight's renderer and its pulses' inputs, in groups; report what is known before it.
 
         That is what poses are beyond the corrections, and by a sample of pulses the time that the flight takes and how
-        many pulses saturate. `progress` is called with a `Progress` of the groups, and of the sample.
+        many pulses saturate. `progress` is called with a `Progress` for groups and sample.
 
         Raises UserError if the flight, its scene or its corrections are invalid, the bottom does not cover it, or its
         echo is outside the record.
@@ -133,7 +133,7 @@ class FlightRenderer(Renderer):
         return renderer, columns
 
     def describe_input(self, name: str, column: Column) -> dict[str, Any]:
-        """Return the attributes of an input of the pulses."""
+        """Return a pulse input's attributes."""
         for setting, text in SETTINGS.items():
             if name.startswith(setting):
                 number = name.removeprefix(setting)
@@ -145,7 +145,7 @@ class FlightRenderer(Renderer):
         return described(name, "flight")
 
     def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
-        """Return the rows of pulses that are rendered together: successive ones of a group."""
+        """Return the rows of pulses rendered together: successive ones in a group."""
         group, first = inputs["group"], 0
         for row in range(1, group.size + 1):
             if row == group.size or row - first == _BATCH or group[row] != group[first]:
@@ -154,12 +154,12 @@ class FlightRenderer(Renderer):
 
     @alone
     def stacked(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Array]:
-        """Return the arrays of pulses of one group that are rendered together; raise `UserError` if that fails."""
+        """Return arrays for one group's pulses rendered together; raise `UserError` if that fails."""
         return self._stacked(inputs)[0]
 
     @alone
     def sample(self, inputs: Mapping[str, Column]) -> tuple[dict[str, Array], dict[str, Array], dict[str, Any]]:
-        """Return arrays of pulses, the coordinates of their dimensions, and the attributes of echoes."""
+        """Return pulse arrays, their dimensions' coordinates, and the echoes' attributes."""
         arrays, echoes = self._stacked(inputs, turned=False)
         names = ("pixel", "angle_x", "angle_y", "sight_x", "sight_y", "beam_share")
         found = {name: Array.of(echoes[name]) for name in names if name in echoes.coords}
@@ -208,7 +208,7 @@ class FlightRenderer(Renderer):
         return found, echoes
 
     def _infrared_record(self, inputs: Mapping[str, Column], later: FloatArray) -> xr.Dataset:
-        """Return the records of the infrared pulses, with times of the level sea for those of the green ones.
+        """Return infrared pulse records, with level-sea times in place of the green pulses'.
 
         `later` is how much later than its times each green shot is [ns].
         """
@@ -224,7 +224,7 @@ class FlightRenderer(Renderer):
         return recorded.assign_coords(surface_time=recorded["surface_time"] + apart)
 
     def _passes(self, *, until_error: bool) -> tuple[int, float, float | None]:
-        """Return the most passes of pulses, the share of the paths of a full one, and the error that ends them."""
+        """Return the pulses' most passes, their share of a full pass's paths, and the error that ends them."""
         from mitransient_lidar.rendering.shots.batches import MOST_PASSES_FOR_ERROR, share_for_error
         from mitransient_lidar.rendering.shots.pilots import MERGED_PASSES
 
@@ -233,9 +233,9 @@ class FlightRenderer(Renderer):
         return (MOST_PASSES_FOR_ERROR, share, error) if until_error else (MERGED_PASSES, share, None)
 
     def _pilots(self, columns: Mapping[str, Column], progress: ProgressCallback | None) -> tuple[xr.Dataset, float]:
-        """Return the waveforms of pilot pulses: of `pilot_rows`, at the same places of the sea in all flights.
+        """Return the pilot pulses' waveforms: `pilot_rows`, at the same sea places in all flights.
 
-        Beside them is the processor time of a pulse of the flight, with as many passes as its error needs [s].
+        Beside them is the processor time per flight pulse, with as many passes as its error needs [s].
         """
         from mitransient_lidar.rendering.shots.pilots import PILOTS
 
@@ -261,18 +261,18 @@ class FlightRenderer(Renderer):
         return xr.concat([one for one, _ in found], "shot", coords="minimal", compat="override"), seconds
 
     def _scene_of(self, inputs: Mapping[str, Column], light: str | None = None) -> ShotScene:
-        """Return the loaded scene of the lidar of pulses of one group, by default for the light of the flight."""
+        """Return the loaded scene with one group's lidar, by default for the flight's light."""
         # That of a scene which was loaded before.
         variants.leave_the_gpu("shots are rendered")
         return _shot_scene(self, *self._lidar_and_record(inputs), light or self.plan.light)
 
     def _lidar_and_record(self, inputs: Mapping[str, Column]) -> tuple[float, float, float, float, TimeAxis]:
-        """Return the lidar of pulses of one group, as of `lidar_of`, and its time bins."""
+        """Return one group's lidar, as from `lidar_of`, and its time bins."""
         assert self.axis is not None
         return *lidar_of(inputs), replace(self.axis, start_ns=float(inputs["record_start_ns"][0]))
 
     def _with_turned_pixels(self, recorded: xr.Dataset, inputs: Mapping[str, Column]) -> xr.Dataset:
-        """Return the record of pulses of one group with the lines of sight of pixels that are turned about the axis."""
+        """Return one group's record, with lines of sight for pixels turned about the axis."""
         turns = pixel_turns(poses_of(inputs.__getitem__))
         if not turns.any():
             return recorded
@@ -286,7 +286,7 @@ class FlightRenderer(Renderer):
         passes: tuple[int, float, float | None],
         pilots: IntArray | None = None,
     ) -> tuple[xr.Dataset, FloatArray, FloatArray]:
-        """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns].
+        """Return pulse waveforms as a series, and how much later than its times each shot is [ns].
 
         The last array are the relative errors of the bins that count. `pilots`: numbers of pilot pulses.
         """
@@ -329,7 +329,7 @@ class FlightRenderer(Renderer):
 
 
 def scene_of(plan: FlightPlan) -> SceneSource:
-    """Return the source of the scene of a flight, with its instrument.
+    """Return a flight's scene source, with its instrument.
 
     Raises UserError if it cannot be read, or lacks a parameter.
     """
@@ -342,7 +342,7 @@ def scene_of(plan: FlightPlan) -> SceneSource:
 
 @functools.lru_cache(maxsize=2)
 def _infrared(renderer: FlightRenderer, bins: int) -> FlightRenderer:
-    """Return the renderer of the infrared pulses of a flight, with so many time bins."""
+    """Return the renderer for a flight's infrared pulses, with so many time bins."""
     plan = renderer.plan.of_infrared()
     scene = scene_of(plan)
     return FlightRenderer(plan, scene, TimeAxis(0.0, float(scene.values["bin_width_ns"]), bins))
@@ -352,7 +352,7 @@ def _infrared(renderer: FlightRenderer, bins: int) -> FlightRenderer:
 def _shot_scene(
     renderer: FlightRenderer, angle_deg: float, height: float, x: float, y: float, axis: TimeAxis, light: str
 ) -> ShotScene:
-    """Return the loaded scene of the lidar of a group."""
+    """Return the loaded scene with a group's lidar."""
     from mitransient_lidar.rendering.shots.scene import ShotScene
 
     params = {**renderer.plan.parameters, "off_nadir_deg": angle_deg, "altitude": height}
@@ -363,7 +363,7 @@ def _shot_scene(
 def _turned_lines(
     renderer: FlightRenderer, angle_deg: float, height: float, x: float, y: float, axis: TimeAxis, turn_deg: float
 ) -> LinesOfSight:
-    """Return the lines of sight of the lidar of a group whose pixels are turned about the receiver's axis [deg]."""
+    """Return lines of sight for a group's lidar, with pixels turned about the receiver's axis [deg]."""
     from mitransient_lidar.rendering.describe import lines_of_sight
 
     scene = _shot_scene(renderer, angle_deg, height, x, y, axis, renderer.plan.light)
@@ -372,12 +372,12 @@ def _turned_lines(
 
 @functools.lru_cache(maxsize=4)
 def _batches(scene: ShotScene, passes: int, share: float, error: float | None) -> ShotBatches:
-    """Return the shots of a scene in batches, whose solids and buffers serve all of them."""
+    """Return a scene's shots in batches; its solids and buffers serve all."""
     return scene.batches(passes, share, error)
 
 
 def _single(values: xr.DataArray, dtype: npt.DTypeLike = np.float32) -> Array:
-    """Return an array of shots, without the name of their dimension."""
+    """Return a shot array, without its dimension's name."""
     # Without the coordinates, which take longer than the values.
     array = Array.of(values.variable.transpose("shot", ...), dtype)
     return array._replace(dims=tuple(dim for dim in array.dims if dim != "shot"))

@@ -29,7 +29,7 @@ _LEAST_ERROR, _LEAST_SLOPE = 1e-6, 1e-9
 
 
 class Facets(NamedTuple):
-    """Heights and slopes of the sea at n places, with standard deviations of their errors."""
+    """Sea heights and slopes at n places, with standard deviations of their errors."""
 
     height: FloatArray  #: [m], shape (n,).
     slope: FloatArray  #: Rise towards +x and +y [1], shape (n, 2).
@@ -39,33 +39,17 @@ class Facets(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceModel:
-    """Mean level of the sea and, with surface points, local planes through them.
+    """Mean level of the sea and, with surface points, local planes through them."""
 
-    Attributes
-    ----------
-    level
-        Mean height [m], with the tide.
-    level_error
-        Its standard error [m].
-    height_deviation
-        Standard deviation of the sea's heights about the level [m].
-    slope_deviation
-        Standard deviation of the sea's slopes, averaged over a beam, in each direction [1].
-    radius
-        Radius of the planes [m]; 0 for a level sea.
-    points
-        Surface points for planes: x, y, z, standard deviation of z [m], time [s], shape (n, 5).
-    residual
-        Standard deviation of the points about planes, by waves that are shorter [m].
-    """
-
-    level: float = 0.0
-    level_error: float = 0.0
-    height_deviation: float = 0.0
+    level: float = 0.0  #: Mean height [m], with the tide.
+    level_error: float = 0.0  #: Its standard error [m].
+    height_deviation: float = 0.0  #: Standard deviation of the sea's heights about the level [m].
+    #: Standard deviation of the sea's slopes, averaged over a beam, in each direction [1].
     slope_deviation: float = 0.0
-    radius: float = 0.0
+    radius: float = 0.0  #: Radius of the planes [m]; 0 for a level sea.
+    #: Surface points for planes: x, y, z, standard deviation of z [m], time [s], shape (n, 5).
     points: FloatArray | None = None
-    residual: float = 0.0
+    residual: float = 0.0  #: Standard deviation of the points about planes, by waves that are shorter [m].
 
     @classmethod
     def fit(
@@ -88,7 +72,7 @@ class SurfaceModel:
         time_s
             Their times [s], shape (n,).
         slope_deviation
-            Standard deviation of the sea's slopes, averaged over a beam, in each direction [1], at least 0.
+            Standard deviation of sea slopes, averaged over a beam, in each direction [1], at least 0.
         radius
             Radius of the planes [m]; 0 for a level sea.
 
@@ -99,18 +83,17 @@ class SurfaceModel:
 
         Notes
         -----
-        The level is the mean with the weights 1/(error^2 + v), where v is the variance of the waves' heights, that of
-        the points, increased by one standard deviation of its error, less that of their errors. A plane h + s . (r_i -
-        r) is fitted at a place r to the at most 24 nearest points within the radius, with the weights 1/(error_i^2 +
-        residual^2) and the prior distributions h ~ N(level, v), s ~ N(0, slope_deviation^2): where points are few, or
-        their errors large, it stays level. Times count as distances of 5 m/s. The residual is the most likely one of
-        heights that are predicted from their neighbours; the sea deviates from a plane by it, and its slopes by 1.5
-        residuals over the root mean square distance of the plane's points.
+        The level is the mean with weights 1/(error^2 + v), with the wave height variance v. This is the points'
+        variance, increased by one standard deviation of its error, minus their errors' variance. A plane h + s . (r_i -
+        r) is fitted at a place r to the at most 24 nearest points within the radius. Weights are 1/(error_i^2 +
+        residual^2), priors h ~ N(level, v) and s ~ N(0, slope_deviation^2). Where points are few, or their errors
+        large, it stays level. Times count as distances of 5 m/s. The residual is the most likely one for heights
+        predicted from their neighbours. The sea deviates from a plane by it; its slopes by 1.5 residuals over the plane
+        points' rms distance.
 
-        Measured over linear waves of winds of 3, 6 and 9 m/s, averaged over beams of 0.6 and 2 m, from 0.5 to 10 points
-        a square metre with errors of 2 to 15 cm, 72 cases: the slopes that are left have 0.24 to 1.02 of the standard
-        deviation of all slopes (median 0.7), and the errors of slopes and heights are 0.4 to 1.7 (median 1.0) times the
-        stated ones.
+        Measured in 72 cases: linear waves at winds of 3, 6 and 9 m/s, averaged over beams of 0.6 and 2 m, with 0.5 to
+        10 points a square metre and errors of 2 to 15 cm. The remaining slopes have 0.24 to 1.02 times all slopes'
+        standard deviation (median 0.7). Slope and height errors are 0.4 to 1.7 (median 1.0) times the stated ones.
         """
         table = finite_array("points", points)
         sigma, time = finite_array("error", error), finite_array("time_s", time_s)
@@ -146,7 +129,7 @@ class SurfaceModel:
         return max(candidates, key=lambda one: one._log_likelihood(sample))
 
     def _log_likelihood(self, sample: FloatArray) -> float:
-        """Return the logarithm of the probability of heights of its points, each predicted from its neighbours."""
+        """Return the log probability of its points' heights, each predicted from its neighbours."""
         x, y, z, error, time = sample.T
         found = self._planes(np.column_stack([x, y]), time, first=1)
         variance = found.height_error**2 + error**2

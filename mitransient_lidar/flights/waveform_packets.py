@@ -1,4 +1,4 @@
-"""Waveforms of a LAS file: packets of samples in a file of their own, and the fields of points that refer to them."""
+"""LAS waveforms: sample packets in their own file, and the point fields that refer to them."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _MOST_SHIFT_PS = 10.0  # 1.5 mm in air
 
 
 class PacketWriter:
-    """Writer of a file of waveform packets (.wdp) of LAS 1.4: a header of 60 bytes, then packets of one size.
+    """Writer of a LAS 1.4 waveform packet file (.wdp): a 60-byte header, then packets of one size.
 
-    Raises UserError if `gain` or `sampling_ns` is not positive, `offset` is not finite, there is no sample, or rounding
-    the spacing to whole picoseconds, as LAS stores it, shifts the last sample by more than 10 ps.
+    Raises UserError if `gain` or `sampling_ns` is not positive, `offset` is not finite, or there is no sample. LAS
+    stores the spacing in whole picoseconds; this rounding may shift the last sample by 10 ps at most.
 
     `file`: file, empty and open for writing, that can seek. `first`: first waveforms, see `append`; they give samples
     per packet, gain, offset and spacing for the file.
@@ -66,20 +66,20 @@ class PacketWriter:
             counts by ``gain`` [V per count] and ``offset`` [V], NaN where a packet is shorter. These and
             ``sampling_ns`` are its attributes, one value for a file. Missing samples become the count nearest to 0 V.
         points : xr.Dataset
-            Over ``point``: ``packet``, index of a packet of `waveforms` or -1 for none; ``time_in_packet_ns``, time of
-            the point after the first sample; ``direction`` over (point, 3), unit vector of the light that arrives at
-            the point; optionally ``group_speed`` [m/s], its speed there, that of light in vacuum otherwise.
+            Over ``point``: ``packet``, packet index in `waveforms` or -1 for none; ``time_in_packet_ns``, time of the
+            point after the first sample; ``direction`` over (point, 3), unit vector of the light that arrives at the
+            point; optionally ``group_speed`` [m/s], its speed there, that of light in vacuum otherwise.
 
         Returns
         -------
         dict
-            Values by laspy's name of a field, each of shape (points,).
+            Values by laspy's field name, shape (points,) each.
 
         Raises
         ------
         UserError
-            If waveforms differ in their attributes, are longer than the first ones or out of range, or a value of the
-            points is not finite or out of range.
+            If waveforms differ in their attributes, are longer than the first ones or out of range, or a point value is
+            not finite or out of range.
         """
         counts = self._counts(waveforms["waveform"])
         fields = self._fields(points, counts.shape[0])
@@ -88,12 +88,12 @@ class PacketWriter:
         return fields
 
     def finish(self) -> None:
-        """Write the number of bytes of all packets into the header."""
+        """Write the packets' total byte count into the header."""
         self._file.seek(_LENGTH_AT)
         self._file.write(struct.pack("<Q", self.packets * self.packet_bytes))
 
     def _counts(self, waveform: xr.DataArray) -> npt.NDArray[np.uint16]:
-        """Return little-endian counts of shape (packets, samples of the file)."""
+        """Return little-endian counts, shape (packets, samples in the file)."""
         for name, value in self._given.items():
             if waveform.attrs[name] != value:
                 raise UserError(f"{name} = {waveform.attrs[name]} must be that of the first waveforms, {value}")

@@ -1,9 +1,9 @@
 """Target detection in a gated camera's images, by the best weighted sum over pixels and gates.
 
-The mean images of renders with and without the target are vectors x of digital numbers. With the covariance D of the
-camera's noise, every matched filter, also against clutter between seas, is D^-1 times a sum of these vectors. So all
-filters follow from scalar products of the vectors, `FilterProducts`. A shadow counts like an echo: its difference is
-negative, and so are its weights.
+Mean images of renders with and without the target are vectors x [DN]. With the covariance D of the camera's noise,
+every matched filter is D^-1 times a sum of these vectors. This also holds against clutter between seas. So all filters
+follow from scalar products of the vectors, `FilterProducts`. A shadow counts like an echo: its difference is negative,
+and so are its weights.
 """
 
 from __future__ import annotations
@@ -239,9 +239,9 @@ class ImageTrial:
     def maps(self, frames: int) -> dict[str, FloatArray]:
         """Return the camera's maps over pixels and gates, shape (*pixels, gate), for one frame.
 
-        The maps are ``background`` and ``difference`` [DN], the weights ``filter_weight`` [1/DN] of the best filter for
-        a number of frames, ``snr`` and the probability of ``saturation`` of the light with the target. Also the
-        target's ``contrast`` (NaN without light), and ``contrast_to_noise`` with its standard error over the renders.
+        The maps are ``background`` and ``difference`` [DN], ``filter_weight`` [1/DN] of the best filter for a number of
+        frames, and ``snr``. ``saturation`` is its probability in the light with the target. Also the target's
+        ``contrast`` (NaN without light), and ``contrast_to_noise`` with its standard error over the renders.
         """
         renders = range(self.light.shape[1])
         coefficients, found = self.products.coefficients(frames, renders), []

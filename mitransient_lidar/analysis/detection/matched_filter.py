@@ -1,4 +1,4 @@
-"""Time of a known echo with unknown height in noisy samples: the matched filter, and the lower bound of its error.
+"""Time of a known echo with unknown height in noisy samples: the matched filter and its lower error bound.
 
 The arguments ``samples`` are records minus the background, shape (shots, samples), and ``templates`` the echo at
 delays, shape (delays, samples). ``delays_ns`` are at least three equal steps [ns]. The noise ``covariance``, shape

@@ -15,7 +15,7 @@ from mitransient_lidar.physics.receiver.chain import ReceiverChain
 
 
 class Rates(NamedTuple):
-    """Fractions of trials, and the limits of their confidence intervals; arrays with one shape."""
+    """Fractions of trials, and their confidence limits; arrays with one shape."""
 
     rate: FloatArray
     low: FloatArray
@@ -48,7 +48,7 @@ def binomial_rates(successes: npt.ArrayLike, trials: int, confidence: float = 0.
 
 
 def exceedance(values: npt.ArrayLike, thresholds: npt.ArrayLike, confidence: float = 0.95) -> Rates:
-    """Return the rates of values, shape (trials,), above thresholds, in the shape of `thresholds`.
+    """Return the share of values, shape (trials,), above thresholds, shaped as `thresholds`.
 
     For shots without a target these are false alarm probabilities, with a target detection probabilities; both at one
     threshold are a point on the receiver operating characteristic. The thresholds must not depend on the values;

@@ -148,7 +148,7 @@ class Experiment:
         return signal.reshape(*signal.shape[:2], -1).astype(np.float64)
 
     def needed(self, name: str, kind: str, pfa: float, pd: float) -> Level:
-        """Return the fraction of the target's signal, or of the pulse energy, for the required detection."""
+        """Return the fraction of target signal or pulse energy for the required detection."""
         from scipy.optimize import brentq
         from scipy.special import ndtri
 

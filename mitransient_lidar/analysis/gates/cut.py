@@ -34,7 +34,7 @@ def cut_gates(dataset: results.Given, train: GateTrain) -> xr.Dataset:
     errors of bins are correlated: the standard error follows from bin errors and their ``error_correlation``, measured
     over the render's passes. Without it, as in a result from an EXR file, it is the quadrature sum times the median
     error inflation for a sum over as many bins. The attributes ``error_inflation_bins`` and ``error_inflation`` give
-    the inflation: linear in the logarithm of the number of bins, and beyond the last one proportional to the square
+    the inflation. It is linear in the logarithm of the bin number, and beyond the last one proportional to the square
     root. The error is at most the sum of the errors, which is used if nothing is known. A gate with weights w is
     equivalent to (sum w)^2 / sum w^2 bins. Derivatives in a result are cut in the same way, with the waveform's
     correlation: ``gate_energy_derivative`` and its standard error, over ``parameter`` too. For gates that are narrower

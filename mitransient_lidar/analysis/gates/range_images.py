@@ -129,9 +129,9 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     Parameters
     ----------
     stack : xarray.Dataset
-        A gate stack with at least 3 gates, whose last dimension is ``gate``; or camera frames, whose mean above the
-        level without light counts, with frame noise and render error. In frames, echoes of less than 4 standard errors
-        and echoes beside saturated gates have no depth: their errors would not hold.
+        A gate stack with at least 3 gates, whose last dimension is ``gate``; or camera frames. Their mean above the
+        dark level counts, with frame noise and render error. In frames, echoes of less than 4 standard errors and
+        echoes beside saturated gates have no depth: their errors would not hold.
     reach : int, optional
         As for `range_from_gates`.
 
@@ -149,8 +149,8 @@ def depth_image(stack: Given, *, reach: int | None = None) -> DepthImage:
     Notes
     -----
     The echo is located in time, and its depth follows from `geometry.LinesOfSight`; without the geometry attributes,
-    from ``gate_depth`` in all pixels. Take the axis of a receiver 20 degrees off nadir at 200 m: a pixel 10 mrad
-    farther from nadir receives the same depth 5.2 ns later, 0.55 m on the axis's depth scale.
+    from ``gate_depth`` in all pixels. Example: a receiver 20 degrees off nadir at 200 m. A pixel 10 mrad farther from
+    nadir receives the same depth 5.2 ns later, 0.55 m on the axis's depth scale.
     """
     stack = dataset_of("stack", stack, "gates", "frames")
     limits: dict[str, Any] = {}

@@ -169,7 +169,7 @@ def jittered_beside(
     energy : ndarray
         Energy in the gates, shape (..., gate) [J], as of the mean; the derivative is in J/ns.
     jitter, included : float
-        Standard deviation of the gate time, and the part of it that the energy has already [ns].
+        Standard deviation of the gate time, and its part that the energy already has [ns].
     step, longest : float
         Time from gate to gate, and the longest one that shows the energy between them [ns].
     """

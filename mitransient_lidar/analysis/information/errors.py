@@ -132,7 +132,7 @@ def estimate_errors(
     residuals
         Differences in standard deviations, shape (pixel, time), 0 where a sample is not used.
     derivatives
-        Derivatives of the model in standard deviations per unit of each parameter, shape (parameter, pixel, time).
+        Model derivatives in standard deviations per unit of each parameter, shape (parameter, pixel, time).
     noise, model
         Errors of the waveforms and of the model's Monte Carlo. Standard deviations are relative to the difference's,
         shape (pixel, time), 0 where a sample is not used; correlations are by the distance in samples, shape (lags,).
@@ -156,17 +156,17 @@ def estimate_errors(
     Notes
     -----
     With the weighted derivatives J and the covariance C of the weighted differences, the parameter covariance is (J^T
-    J)^-1 J^T C J (J^T J)^-1. For independent errors this is (J^T J)^-1. The chi-squared has the mean tr(Q C) and the
-    variance 2 tr(Q C Q C) with Q = 1 - J (J^T J)^-1 J^T, as has a scaled chi-squared distribution (F. E. Satterthwaite,
+    J)^-1 J^T C J (J^T J)^-1. For independent errors this is (J^T J)^-1. With Q = 1 - J (J^T J)^-1 J^T, the chi-squared
+    has the mean tr(Q C) and the variance 2 tr(Q C Q C), like a scaled chi-squared distribution (F. E. Satterthwaite,
     Biometrics Bulletin 2, 110 (1946), doi:10.2307/3002019).
 
     Errors in distant bins are correlated, too, since they share paths, and their standard errors from few passes are
-    uncertain. With pass batches D, J^T C J is therefore J^T D^T D J instead. The inverse of such an estimate with f
-    degrees of freedom, one less than batches, is on average too large by f/(f - P - 1) for P parameters (J. Hartlap, P.
-    Simon and P. Schneider, Astron. Astrophys. 464, 399 (2007), doi:10.1051/0004-6361:20066170). The covariance is
-    multiplied by this, so that the squared distance between estimates and truth has the mean P. Where the share s of
-    the covariance comes from batches, f is divided by s^2, as Satterthwaite does. Fewer than P + 3 batches are not
-    used, nor are any for the chi-squared.
+    uncertain. With pass batches D, J^T C J is therefore J^T D^T D J instead. Such an estimate has f degrees of freedom,
+    one less than batches. Its mean inverse is too large by f/(f - P - 1) for P parameters (J. Hartlap, P. Simon and P.
+    Schneider, Astron. Astrophys. 464, 399 (2007), doi:10.1051/0004-6361:20066170). The covariance is multiplied by
+    this, so that the squared distance between estimates and truth has the mean P. Where the share s of the covariance
+    comes from batches, f is divided by s^2, as Satterthwaite does. Fewer than P + 3 batches are not used, nor are any
+    for the chi-squared.
     """
     own, by_render = batches
     if borrows := borrows and own is None and by_render is not None:
@@ -274,7 +274,7 @@ def _correlated(vectors: FloatArray, deviation: FloatArray, correlation: FloatAr
 
 
 def _trace_of_square(kinds: Sequence[tuple[FloatArray, FloatArray]]) -> float:
-    """Return the trace of the squared covariance of all error kinds together."""
+    """Return the trace of the squared covariance, all error kinds together."""
     pixels, count = kinds[0][0].shape
     total = 0.0
     for lag in range(min(count, max(correlation.size for _, correlation in kinds))):

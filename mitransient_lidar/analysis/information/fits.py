@@ -123,9 +123,9 @@ class WaveformFit:
         """Move `values` from the starts towards the solution, where `run` begins, by a model that may be coarse.
 
         Light falls exponentially with water coefficients, so that logarithms of samples are nearly linear in them where
-        values are not. Least squares of logarithms, for samples with a relative error of a tenth besides their own,
-        come close to the solution. From some starts, least squares of values need many steps, or end elsewhere. Limits
-        are as for `run`, which has one render left at least.
+        values are not. Least squares of logarithms approach the solution; samples there have a relative error of a
+        tenth besides their own. From some starts, least squares of values need many steps, or end elsewhere. Limits are
+        as for `run`, which has one render left at least.
         """
         self._limit, self._until = integer("most_renders", most_renders, 2, 10_000) - 1, until
         blurs: tuple[float, ...] = (0.0,)
@@ -188,10 +188,10 @@ class WaveformFit:
             ``correlation`` over (parameter, other_parameter). Over the waveform dimensions: ``measured``,
             ``measured_stderr``, ``fitted``, ``fitted_stderr`` (the model's Monte Carlo), ``residual`` in standard
             deviations of both, and ``used`` (1 for fitted samples). Attributes: ``chi_squared``, its mean ``expected``
-            and ``freedom`` (for errors that neighbours share, too), ``probability`` of a larger one, ``renders``,
-            ``rounds``, ``converged``, ``refused`` (1 where the scene does not explain the waveforms), ``interrupted``
-            (1 after Ctrl-C), and ``messages``, sentences on what the waveforms do not determine. The squared
-            ``residual`` values add up to ``chi_squared``.
+            and ``freedom`` (also for errors that neighbours share), ``probability`` of a larger one, ``renders``,
+            ``rounds``, ``converged``, and ``refused`` (1 where the scene does not explain the waveforms).
+            ``interrupted`` is 1 after Ctrl-C; ``messages`` are sentences on what the waveforms do not determine. The
+            squared ``residual`` values add up to ``chi_squared``.
         """
         self._limit, self._until = integer("most_renders", most_renders, 2, 10_000), until
         self._rendered, self._exhausted = None, False

@@ -111,7 +111,7 @@ class Prediction(NamedTuple):
 
 
 def with_waveforms(source: Given) -> Given:
-    """Return the dataset of a result or of signals, given itself or by its file; a table's path unchanged.
+    """Return the dataset of a result or signals, given itself or by its file; a table's path unchanged.
 
     Raises `UserError` if it is another dataset, or its file cannot be read.
     """
@@ -136,11 +136,11 @@ def measured(
     ----------
     source
         A result with ``waveform``, or with the ``signal`` of `analysis.receiver.detect_waveforms`, whose records are
-        averaged; its EXR or NetCDF file; or a CSV file with the column ``time_ns``, one column for each pixel in any
-        unit, and optionally columns ``NAME_stderr`` with their standard errors. Waveforms of LAS, LAZ and PulseWaves
-        files (`results.waveform_files`) are such a table: their mean, less the level before the surface.
+        averaged; or its EXR or NetCDF file. A CSV file has the column ``time_ns``, one column for each pixel in any
+        unit, and optionally ``NAME_stderr`` with their standard errors. LAS, LAZ and PulseWaves files
+        (`results.waveform_files`) give such a table: their mean waveform, minus the level before the surface.
     noise
-        Standard deviation of every waveform sample, above 0 and in the waveforms' unit, instead of their own.
+        Standard deviation of every waveform sample, above 0 and in the waveforms' unit, in place of their own.
     receiver
         Receiver of a signal, as for `detect_waveforms`; by default the one that its attributes name. For a table, the
         receiver whose response and noise the model gets: a preset, an instrument, or a TOML file. After a logarithm,
@@ -176,7 +176,7 @@ def measured(
 def predict(found: Measured, dataset: xr.Dataset, parameters: list[str]) -> Prediction:
     """Return a render's prediction, with derivatives, for the pixels of waveforms, after their receiver if any.
 
-    Derivatives after a receiver are central differences of its closed form in the direction of the derivative. Raises
+    Derivatives after a receiver are central differences: of its closed form, in the derivative's direction. Raises
     `UserError` if the render has other pixels, lacks a derivative, or holds values that are not finite.
     """
     dataset = _same_pixels(found, dataset)
@@ -257,8 +257,8 @@ def _recorded(
 def batch_deviations(dataset: xr.Dataset, dims: tuple[str, ...]) -> FloatArray | None:
     """Return the deviations of a render's pass batches from its mean, shape (batch, pixel, time), or None.
 
-    The sum of their outer products is an unbiased estimate of the error covariance over all bins. For N passes in B
-    batches, the deviations of means over n passes are multiplied by the root of n/N/(B - 1).
+    Their outer products add up to an unbiased estimate of the error covariance over all bins. For N passes in B
+    batches, deviations of means over n passes are multiplied by sqrt(n/N/(B - 1)).
     """
     if "waveform_batch" not in dataset or dataset.sizes["batch"] < 2:
         return None

@@ -82,8 +82,8 @@ def loss_error(
     column's. From each its value for homogeneous water is subtracted. Both are means over the shots, in the same water.
 
     Waveforms are of one pixel, as is their table from `echo_table.extract` with `layers`. Bottom depths and one-way
-    paths to them in the water [m] are per shot, the column attenuation along the path [1/m] is a mean, and the
-    scattered light is that in homogeneous water.
+    paths to them in the water [m] are per shot. The column attenuation along the path [1/m] is a mean; the scattered
+    light is for homogeneous water.
     """
     depths = 2 * attenuation * path
     if light is None or not np.isfinite(depths).any():
@@ -136,10 +136,10 @@ def whole_energy(
     """Return the energies of bottom echoes with their tails, and their errors by noise [J].
 
     Light that the water scatters forwards arrives later, up to four echo widths: 1 to 7 % of the bottom's energy is not
-    in the Gaussian fitted to the echo. The signal sum about the echo contains all of it, after subtraction of the
-    column before the echo and the column's late light after it. The Gaussian counts where noise makes the sum less
-    certain than 10 %, or there is no column. It also counts where the sum would reach beyond the record, or another
-    echo is less than four echo widths before the bottom's.
+    in the Gaussian fitted to the echo. The signal sum about the echo contains all of it. The column before the echo,
+    and its late light after it, are subtracted. The Gaussian counts where noise makes the sum less certain than 10 %,
+    or there is no column. It also counts where the sum would reach beyond the record, or another echo is less than four
+    echo widths before the bottom's.
 
     Parameters as for `loss_error`.
     """

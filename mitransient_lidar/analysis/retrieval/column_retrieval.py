@@ -1,4 +1,4 @@
-"""Decay of the column's signal with depth, and optical properties of the water and bottom reflectance from it.
+"""Decay of the column's signal with depth; from it, water properties and bottom reflectance.
 
 Coefficients are in 1/m, lengths in m. A column's level and decay determine two properties, bb and a (hence Kd). The
 third, c, requires a narrow field of view or an assumption about bb/b.
@@ -39,9 +39,9 @@ class ColumnBins:
     (`refraction.solid_angle_per_area`), and its logarithm fitted by A - 2 K s. K is per metre of slant path; K = c for
     singly scattered light, even in a wide beam off nadir, since a mean over depths has the exponential's slope.
 
-    K depends on the sea. Ripples scatter light out of a narrow field of view. Waves that focus both beam and view
-    increase the signal from some metres below. Single scattering with c = 0.3, wind 3 m/s and 20 degrees off nadir gave
-    0.287 (waves) to 0.304 (ripples alone, a field of view of 4 mrad).
+    K depends on the sea. Ripples scatter light out of narrow fields of view. Waves that focus both beam and view
+    increase the signal from some metres below. Single scattering (c = 0.3, 3 m/s, 20 degrees off nadir) gave 0.287 with
+    waves, and 0.304 with ripples alone and a 4 mrad field of view.
     """
 
     inside: npt.NDArray[np.intp]
@@ -55,8 +55,8 @@ class ColumnBins:
         """Return the record bins between two depths [m], 0 <= `min_depth` < `max_depth`.
 
         `edge` is the largest angle from the axis of light that the receiver detects [rad]. Raises `UserError` if the
-        depths are out of order, the surface echo at the beam's edge reaches below the first, or the record does not
-        include them and at least 3 bins between them.
+        depths are out of order, or the surface echo at the beam's edge reaches below the first. The record must include
+        them, with at least 3 bins between them.
         """
         top, bottom = non_negative("min_depth", min_depth), positive("max_depth", max_depth)
         if bottom <= top:
@@ -144,7 +144,7 @@ class WaterEstimate:
 
 
 def water_of_column(decay: npt.ArrayLike, backscatter: npt.ArrayLike, excess: float, level: float) -> WaterEstimate:
-    """Estimate absorption, backscattering, Kd and bounds of c from a column in a wide field of view.
+    """Estimate absorption, backscattering, Kd and bounds of c from a column in a wide view.
 
     The attenuation K along the path is that in the column's signal, exp(-2 K s) [1/m]. The backscatter b p(pi) includes
     multiple scattering [1/(m sr)]: it is the power at the surface, extrapolated with K, over `LidarSystem.column_gain`

@@ -54,7 +54,7 @@ def surface_slopes(
     slope_deviation: tuple[float, float] | None = None,
     efficiency: float | None = None,
 ) -> xr.Dataset:
-    """Estimate slope, direction and height of the surface from times and strengths of the pixels' surface echoes.
+    """Estimate slope, direction and height of the surface from the pixels' surface echoes: times and strengths.
 
     Raises `UserError` if the dataset lacks pixels, a coordinate or an attribute, or a number is out of range.
 
@@ -80,10 +80,10 @@ def surface_slopes(
         a rise to the left [1], with ``_stderr``; ``slope_deg`` and ``slope_direction_deg`` of the steepest rise from
         the lidar's azimuth to the left [degree]; ``surface_range`` along the axis, with ``_stderr``, and
         ``surface_height`` above the mean level [m], with ``_stderr``; ``plane_misfit`` [ns]. NaN where the pixels do
-        not determine it. Attributes: ``slope_method``, ``times and strengths``, ``times on a sea`` or ``times``, and
-        ``slope_prior_deviation``, prior standard deviations of the slopes along and across [1] and of the range [m].
-        Without a sea model, a slope beyond 5 standard deviations of the sea's slopes (attribute
-        ``surface_slope_variance``) is NaN as well, and ``slope_refused`` is 1.
+        not determine it. Attributes: ``slope_method``: ``times and strengths``, ``times on a sea`` or ``times``; and
+        ``slope_prior_deviation``: prior standard deviations along and across [1] and of the range [m]. Without a sea
+        model, a slope beyond 5 standard deviations of the sea's slopes (attribute ``surface_slope_variance``) is NaN as
+        well, and ``slope_refused`` is 1.
 
     Notes
     -----
@@ -199,10 +199,10 @@ def bottom(dataset: xr.Dataset, slopes: xr.Dataset, *, efficiency: float | None 
 
     Column and bottom decay as `scattered_light` finds for homogeneous water with typical particles. The light is the
     beam's light in the pixels (coordinate ``beam_share``) through the open part of the aperture. Reflectance errors
-    include noise, 1 % of the echo energy, the unknown particle bb/b, waves that focus light, slope and height of the
-    sea, and the beam share that targets hide. They also include layers: differences from homogeneous water, or 3 % of
-    the optical depth of both ways in columns too short to be tested. A relative error above 0.5 leaves no value. Errors
-    of efficiencies and of the pulse energy are not included.
+    include noise, 1 % of the echo energy, and the unknown particle bb/b. Focusing waves, sea slope and height, and the
+    beam share that targets hide add to them. So do layers: differences from homogeneous water, or 3 % of the two-way
+    optical depth where columns are too short for a test. A relative error above 0.5 leaves no value. Errors of
+    efficiencies and pulse energy are not included.
 
     A correction that is not expected to lower the variance is not applied. The slope correction is left out where
     `slope_corrections.variances` gives no lower variance with it, and the column correction where its noise exceeds the

@@ -183,9 +183,9 @@ def light_of(
     decay, backscatter
         Attenuation of the exponential along the path [1/m], and its level at the surface as a backscatter [1/(m sr)].
     path, weights
-        Paths in the bins of the exponential's fit [m], and weights of the column's logarithm there, shape (bins,).
+        Paths in the exponential's fitted bins [m], and weights of the column's logarithm there, shape (bins,).
     deepest
-        Path of the bottom echo, or of the deepest light [m].
+        Path of the bottom echo or deepest light [m].
     ratio
         Particle bb/b.
     """
@@ -208,7 +208,7 @@ def light_of(
 def _curves(
     view: View, a: float, bb: float, b: float, phase: PowerLawTable, depth: float, paths: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return path and signal of the column, and path and logarithm of bottoms, for `ScatteredLight`."""
+    """Return path and signal of the column, and paths and logarithms of bottoms, for `ScatteredLight`."""
     from scipy.ndimage import gaussian_filter1d
 
     geometry, rng = view.system, np.random.default_rng(0)

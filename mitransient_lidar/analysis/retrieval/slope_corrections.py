@@ -65,8 +65,8 @@ def bottom_gain(surface_range: npt.ArrayLike, path: npt.ArrayLike, n: float, ray
 
     Notes
     -----
-    T is the facet's Fresnel transmittance. A narrow pencil from the bottom point spreads through a plane with S_s = n R
-    + s and S_t = n R cos_water/cos_air + s cos_air/cos_water, by Snell's law across and in the plane of incidence.
+    T is the facet's Fresnel transmittance. By Snell's law, a narrow pencil from the bottom point spreads through a
+    plane with S_s = n R + s across the plane of incidence, and S_t = n R cos_water/cos_air + s cos_air/cos_water in it.
     """
     distance, length = np.asarray(surface_range, dtype=np.float64), np.asarray(path, dtype=np.float64)
     known = np.isfinite(ray.cos_air)
@@ -99,8 +99,8 @@ def variances(
     surface_range : float
         Range of a level sea at its mean height [m].
     before, after : sequence of 3 array_like
-        Standard deviations of slopes and range on the sea, infinite where unknown, and standard errors of their
-        estimates; they broadcast. A NaN error, for a slope that is not estimated, counts in neither.
+        Standard deviations of slopes and range on the sea, infinite where unknown; standard errors of their estimates.
+        They broadcast. A NaN error, for a slope that is not estimated, counts in neither.
     """
     level = np.array([0.0, 0.0, surface_range])
     without, corrected = np.zeros(1), np.zeros(1)

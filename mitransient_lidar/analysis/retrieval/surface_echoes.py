@@ -151,16 +151,16 @@ def sea_shots(lidar: SeaLidar, wind_speed: float, wind_direction: float, *, seed
 
     Notes
     -----
-    Seas have the spectrum of Elfouhaily et al. (1997), doi:10.1029/97JC00467, with its short waves scaled to the slope
-    variances of Cox and Munk (1954), doi:10.1364/JOSA.44.000838. A cell side is a quarter of the beam's standard
-    deviation on the sea, at most 0.5 m. Ripples have the slope variance that cells do not resolve; waves longer than
-    the 512 cells of a realisation add planes with random height and slopes.
+    Seas have the Elfouhaily et al. spectrum (1997, doi:10.1029/97JC00467). Its short waves are scaled to the Cox and
+    Munk slope variances (1954, doi:10.1364/JOSA.44.000838). A cell side is a quarter of the beam's standard deviation
+    on the sea, at most 0.5 m. Ripples have the slope variance that cells do not resolve; waves longer than the 512
+    cells of a realisation add planes with random height and slopes.
 
     A horizontal area dA sends the energy Q A p F(0) D dA/(4 n_z R^4) back to the aperture A. Here Q p is the beam's
     energy per solid angle, R the distance, n_z the vertical component of the facet normal, and F the Fresnel
-    reflectance. The ripple normals' distribution about the facet's is D = exp(-s_u^2/(2 v_u) - s_c^2/(2 v_c)) / (2 pi
-    sqrt(v_u v_c) cos^4), for slopes s of the ray against the facet and ripple slope variances v. See Walter, Marschner,
-    Li and Torrance 2007, doi:10.2312/EGWR/EGSR07/195-206, eq. 20 and 25, without masking.
+    reflectance. Ripple normals have the distribution D = exp(-s_u^2/(2 v_u) - s_c^2/(2 v_c)) / (2 pi sqrt(v_u v_c)
+    cos^4) about the facet's, for ray slopes s against the facet and ripple slope variances v. See Walter, Marschner, Li
+    and Torrance 2007, doi:10.2312/EGWR/EGSR07/195-206, eq. 20 and 25, without masking.
     """
     wind = in_range("wind_speed", wind_speed, LEAST_WIND_SPEED, MAX_WIND_SPEED)
     spectrum = MatchedSpectrum(ElfouhailySpectrum(wind, direction=wind_direction), *cox_munk(wind))

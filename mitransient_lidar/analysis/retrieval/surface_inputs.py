@@ -32,7 +32,7 @@ def pixel_light(dataset: xr.Dataset) -> PixelLight:
 
 
 def largest_deviations(dataset: xr.Dataset) -> tuple[float, float, float]:
-    """Return upper limits of the slope standard deviations along and across [1], and of the range's [m].
+    """Return upper limits of the standard deviations of slopes along and across [1] and range [m].
 
     With no knowledge of the sea but its total slope variance, the slopes over a footprint vary at most as all its
     slopes do. Its height varies at most like the fully developed sea with this slope variance. Its deviation is sigma =

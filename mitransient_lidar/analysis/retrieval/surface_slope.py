@@ -123,8 +123,8 @@ def fit_plane(
     with the distance in angle_x as exp(-dx^2/(2 spread^2)). It raises the error along and lowers the error across. One
     facet per pixel and 0.4 come from 600 rendered shots at 6 m/s along the wind, 20 degrees off nadir, views of 15 and
     30 mrad. Pixel centres had errors of 0.85 to 1.13 spreads, with correlations of 0.30 to 0.43 between adjacent pixels
-    and -0.24 to 0.18 otherwise. The root mean square of error over stated error is 1.04 to 1.28 along and 0.78 to 0.91
-    across, 0.86 to 1.00 with a prior; in 120 shots across the wind, 0.81 to 1.24.
+    and -0.24 to 0.18 otherwise. The rms ratio of error to stated error is 1.04 to 1.28 along, 0.78 to 0.91 across, and
+    0.86 to 1.00 with a prior; in 120 shots across the wind, 0.81 to 1.24.
 
     Pixels narrow in angle_x are best, since it determines the time. Pixels that cut a wide beam have skewed light, and
     a symmetric echo fit lies too near to the axis. A level sea then appears to face the lidar by up to 1.5 degrees.
@@ -248,8 +248,8 @@ def slopes_on_sea(echoes: PixelEchoes, shots: SeaShots, scale: float | None) -> 
     covariance Cov(a, a) - Cov(a, y) (Cov(y, y) + N)^-1 Cov(y, a). It has the least mean square error among linear
     estimates and is the posterior mean for Gaussian a and y (Rodgers 2000, Inverse Methods for Atmospheric Sounding,
     eq. 2.44; Kay 1993, Fundamentals of Statistical Signal Processing I, section 12.5). Means and covariances come from
-    `shots`; thus the prior of a is the sea's. Errors include the effects of waves within the footprint: an uneven echo
-    has another centre than its pixel, and reflects the slopes of few facets. N is the measurement covariance.
+    `shots`; thus the prior of a is the sea's. Errors include waves within the footprint: an uneven echo has another
+    centre than its pixel, and reflects few facets' slopes. N is the measurement covariance.
 
     Observations are each pixel's time, which measures the mean plane by its distance, and its strength as the deviation
     u = sqrt(2 ln(E_0/(E + e))). The echo energy E is proportional to the density of specular slopes. It is
@@ -259,14 +259,14 @@ def slopes_on_sea(echoes: PixelEchoes, shots: SeaShots, scale: float | None) -> 
     +- e.
 
     Fit errors are 0.25 of the energy and e. In time they are 0.03 echo widths, and 1.5 spreads of the light over the
-    pixel for echoes far fainter than 0.4 column energies. These were measured on one sea (6 m/s, pulses of 5 ns, column
-    of c = 0.3 1/m); e scales with the column in other waters.
+    pixel for echoes far fainter than 0.4 column energies. These were measured on one sea (6 m/s, 5 ns pulses, column
+    with c = 0.3 1/m); e scales with the column in other waters.
 
-    Stated errors hold over all shots on a sea. In 200 others each at 3, 6 and 10 m/s, 20 degrees off nadir, the root
-    mean square of error over stated error was 0.88 to 1.06 along and 0.89 to 1.04 across. The correlation with the true
-    slope along was 0.63, 0.88 to 0.92 and 0.96 for 2x2 pixels, and 0.71, 0.92 to 0.94 and 0.97 for 1x4. They do not
-    hold for each slope. At 6 m/s, faces away by more than 5 degrees, whose echoes the column hides, are estimated as
-    about 4 degrees, with 1.6 to 1.9 times the stated errors.
+    Stated errors hold over all shots on a sea. In 200 others each at 3, 6 and 10 m/s, 20 degrees off nadir, the rms
+    ratio of error to stated error was 0.88 to 1.06 along and 0.89 to 1.04 across. The correlation with the true slope
+    along was 0.63, 0.88 to 0.92 and 0.96 for 2x2 pixels, and 0.71, 0.92 to 0.94 and 0.97 for 1x4. They do not hold for
+    each slope. At 6 m/s, faces away by more than 5 degrees, whose echoes the column hides, are estimated as about 4
+    degrees, with 1.6 to 1.9 times the stated errors.
     """
     truth = np.stack([shots.along, shots.across, shots.height], axis=1)
     energy = np.maximum(np.nan_to_num(echoes.energy), 0)
@@ -297,7 +297,7 @@ def slopes_on_sea(echoes: PixelEchoes, shots: SeaShots, scale: float | None) -> 
 
 
 def _norm(*errors: FloatArray | float) -> FloatArray:
-    """Return the root of the summed squares of independent errors; NaN counts as 0."""
+    """Return the root sum square of independent errors; NaN counts as 0."""
     return np.asarray(np.sqrt(sum(np.nan_to_num(error) ** 2 for error in errors)))
 
 

@@ -27,8 +27,8 @@ _RUN = 7  # bins of the running mean from which a logarithm is weighted
 class ColumnFit:
     """Exponential signals of water columns; shape (n,) each, NaN without a column.
 
-    Signal extrapolated to the surface [unit of the record], rate of decay [1/ns], correlation of their errors, squared
-    residuals in units of the noise per degree of freedom, and number of bins.
+    Signal extrapolated to the surface [record's unit], decay rate [1/ns], error correlation, squared residuals in noise
+    units per degree of freedom, and number of bins.
     """
 
     level: FloatArray
@@ -49,7 +49,7 @@ def column_fit(
 ) -> ColumnFit:
     """Fit P(t) = gain(t) level exp(-decay (t - t_surface)) to the bins of a column.
 
-    Weighted least squares in the power, unbiased, from the first guess of a fit of logarithms.
+    Weighted least squares in the power, unbiased, started from a fit of logarithms.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def column_fit(
     Returns
     -------
     ColumnFit
-        NaN for columns of less than 8 bins, and without a positive level of an error below 100 %.
+        NaN for columns below 8 bins, and without a positive level whose error is below 100 %.
     """
     start, end, surface = (np.asarray(v, dtype=np.float64)[:, np.newaxis] for v in (start_ns, end_ns, surface_ns))
     delay = records.time_ns - np.nan_to_num(surface)
@@ -156,10 +156,10 @@ def _log_line(
 
 @dataclass(frozen=True)
 class ChangePoints:
-    """Changes of the exponentials of columns, the strongest first; shape (n, layers).
+    """Changes in the columns' exponentials, the strongest first; shape (n, layers).
 
-    Times of the changes [ns], NaN without further bins, upper bounds of the probability that noise alone causes as
-    strong a change in any bin, logarithm of the signal behind the change over that before it, and decay rates [1/ns].
+    Times of the changes [ns], NaN without further bins, and upper probability bounds that noise alone causes as strong
+    a change in any bin. Further the log ratio between the signals after and before the change, and decay rates [1/ns].
     """
 
     time_ns: FloatArray
@@ -179,17 +179,17 @@ def change_points(
     model_error: float = 0.02,
     blur_ns: float = 0.0,
 ) -> ChangePoints:
-    """Test columns for changes of the level or the rate of their exponential.
+    """Test columns for changes in level or rate of their exponential.
 
     At every bin, two lines through the logarithms before and behind it are compared with one line through both. With
     noise alone, the two additional parameters lower the weighted squares by more than x with the probability exp(-x/2)
-    at one bin, and with at most N exp(-x/2) at any of N bins (Bonferroni). Further changes are searched for between
-    those already found (binary segmentation; Scott and Knott 1974, Biometrics 30, 507-512).
+    at one bin. At any of N bins the probability is at most N exp(-x/2) (Bonferroni). Further changes are searched for
+    between those already found (binary segmentation; Scott and Knott 1974, Biometrics 30, 507-512).
 
     Parameters
     ----------
     records : Records
-        The waveforms, used up to the first bin with a signal of less than six times the noise.
+        The waveforms, up to the first bin whose signal is below six times the noise.
     start_ns, end_ns : array_like, shape (n,)
         First and last bin centres of the column [ns]; NaN without a column.
     gain : array_like, shape () or (n, time)
@@ -284,7 +284,7 @@ class _Sums:
         return wyy - wy**2 / total - slope * mixed, slope, wx / total, wy / total
 
     def best_split(self, low: IntArray, high: IntArray) -> tuple[FloatArray, IntArray]:
-        """Return the decrease of the squares by the best split of the bins [low, high), and its bin; shape (n,)."""
+        """Return how much the best split of bins [low, high) lowers the squares, and its bin; shape (n,)."""
         places = np.arange(self.sums.shape[2])
         at_low, at_high = (
             np.take_along_axis(self.sums, edge[np.newaxis, :, np.newaxis], axis=2) for edge in (low, high)

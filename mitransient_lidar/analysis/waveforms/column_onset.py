@@ -1,4 +1,4 @@
-"""Onset of the water column's signal behind the surface: mean focusing of light by waves, and absorption."""
+"""Onset of the column signal after the surface: mean focusing by waves, and absorption."""
 
 from __future__ import annotations
 
@@ -61,21 +61,11 @@ class Focusing:
 
 @dataclass(frozen=True)
 class Fading:
-    """How the signal of a column fades by the absorption of pure water alone, as it does in the near infrared.
+    """How a column's signal fades by pure-water absorption alone, as in the near infrared."""
 
-    Attributes
-    ----------
-    rate
-        Least rate of decay [1/ns].
-    clearest
-        Backscattering coefficient of the clearest sea water [1/m].
-    opaque
-        Whether a column has faded within an echo of its surface.
-    """
-
-    rate: float
-    clearest: float
-    opaque: bool
+    rate: float  #: Least rate of decay [1/ns].
+    clearest: float  #: Backscattering coefficient of the clearest sea water [1/m].
+    opaque: bool  #: Whether a column has faded within an echo of its surface.
 
     @classmethod
     def of(cls, wavelength_nm: float, metres_per_ns: float, echo_fwhm_ns: float) -> Fading:
@@ -93,8 +83,8 @@ class Fading:
     def delay(self, energy: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what the light of an opaque column delays an echo that includes it, and its standard deviation [ns].
 
-        The column has a share of the light between that of the clearest water and that of turbid water of a
-        backscattering coefficient of 0.02 1/m, uniformly distributed, and is as late as it decays on average.
+        The column's share of the light is uniformly distributed between clearest water and turbid water that
+        backscatters 0.02 1/m. The column is as late as it decays on average.
 
         Parameters
         ----------
@@ -114,17 +104,10 @@ class Fading:
 
 @dataclass(frozen=True)
 class ColumnOnset:
-    """Signal F(u) of a column from u = 0 on, blurred by a Gaussian: F = 1, or the focusing of light by waves.
+    """Signal F(u) of a column from u = 0 on, blurred by a Gaussian: F = 1, or the focusing of light by waves."""
 
-    Attributes
-    ----------
-    largest_sigma
-        Largest standard deviation of the blur [ns].
-    times, factors
-        Times from the surface [ns], and F at them, linear between them.
-    """
-
-    largest_sigma: float = 1.0
+    largest_sigma: float = 1.0  #: Largest standard deviation of the blur [ns].
+    #: Times from the surface [ns], and F at them, linear between them.
     times: FloatArray = field(default_factory=lambda: np.zeros(1))
     factors: FloatArray = field(default_factory=lambda: np.ones(1))
     _tables: list[FloatArray] = field(init=False, repr=False)

@@ -1,4 +1,4 @@
-"""Tables of echoes as frames of pandas, as printed lines, and as CSV files."""
+"""Echo tables as pandas frames, as printed lines, and as CSV files."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ NUMBERS = ("time_ns", "depth_m", "amplitude", "energy", "width_ns")
 
 
 def flag_names(flags: int) -> str:
-    """Return the names of the `EchoFlag` in a sum of flags, separated by spaces; empty for 0."""
+    """Return the `EchoFlag` names in a sum of flags, separated by spaces; empty for 0."""
     return " ".join(str(flag.name).lower() for flag in EchoFlag if flags & flag)
 
 
 def unknown_depth(echo: str, flags: int, has_surface: bool) -> str:
-    """Return why the depth of an echo is unknown, given its sum of `EchoFlag` and whether its surface is known."""
+    """Return why an echo's depth is unknown, given its sum of `EchoFlag` and whether its surface is known."""
     if flags & EchoFlag.NO_SURFACE_LIGHT:
         return "no surface light"
     if flags & EchoFlag.NO_ECHO:
@@ -41,9 +41,9 @@ def unknown_depth(echo: str, flags: int, has_surface: bool) -> str:
 def echo_frame(table: xr.Dataset) -> pd.DataFrame:
     """Return a table of `echo_table.extract` with one row per waveform, estimator and echo.
 
-    The columns are the dimensions, other coordinates such as ``angle_x``, ``angle_y`` and the truth of each shot, the
-    quantities of the echo, its ``class`` and ``flags`` as names, ``unknown_depth``, the reason for a depth of NaN, and
-    ``attenuation``.
+    The columns are the dimensions, other coordinates such as ``angle_x``, ``angle_y`` and each shot's truth, and the
+    echo's quantities. ``class`` and ``flags`` are names, ``unknown_depth`` is the reason for a NaN depth,
+    ``attenuation`` the column's.
     """
     dims = [str(dim) for dim in table["time_ns"].dims]
     known = [
@@ -66,7 +66,7 @@ def echo_frame(table: xr.Dataset) -> pd.DataFrame:
 
 
 def save_csv(tables: xr.Dataset | Iterable[xr.Dataset], path: str | os.PathLike[str]) -> None:
-    """Write or replace a CSV file of one or more tables of `echo_table.extract`, with empty cells for unknown values.
+    """Write or replace a CSV file with one or more tables from `echo_table.extract`; unknown values are empty cells.
 
     Further tables add rows with the columns of the first one; one of them is in memory at a time.
     """
@@ -74,7 +74,7 @@ def save_csv(tables: xr.Dataset | Iterable[xr.Dataset], path: str | os.PathLike[
 
 
 def describe_echoes(found: xr.Dataset) -> list[str]:
-    """Return the lines of a table of the echoes, and the properties of the columns."""
+    """Return the lines of an echo table, and the column properties."""
     frame = echo_frame(found)
     # Of missing echoes, only surface and bottom are listed; the printed error of a depth includes that of the method.
     frame = frame[~frame["flags"].str.contains("no_echo") | frame["echo"].isin(["surface", "bottom"])]

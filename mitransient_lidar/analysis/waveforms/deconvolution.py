@@ -93,9 +93,9 @@ def _blur(first: int, weights: FloatArray, size: int) -> tuple[Operator, Operato
 def deconvolution_offset(
     template: Template, kernel: tuple[int, FloatArray], bin_ns: float, echo_fwhm_ns: float, iterations: int = 50
 ) -> float:
-    """Return the bias of `deconvolved_echo` [ns], its time of an ideal echo that arrives at 0.
+    """Return the bias [ns] of `deconvolved_echo`: its time for an ideal echo that arrives at 0.
 
-    It is zero for a symmetric pulse; a finite number of iterations does not fully remove the tail of a response.
+    It is zero for a symmetric pulse; finite iterations do not fully remove a response's tail.
     """
     records, place = ideal_echo(template, bin_ns, echo_fwhm_ns)
     sharp = richardson_lucy(records.power, kernel, iterations=iterations)
@@ -108,14 +108,14 @@ def deconvolved_echo(
 ) -> Echoes:
     """Measure an echo in records deconvolved by `richardson_lucy`, shape (n, time).
 
-    Time and width are the first two moments of the deconvolved record within three quarters of an echo width on either
-    side of its maximum near `bins`, the energy is its integral. The errors are those of a maximum-likelihood fit of one
-    echo of the width in the record, for the given noise. The scatter after few iterations agrees with them within a
-    fifth in time and energy; that of the width is smaller, by up to three quarters. The amplitude is that of an echo of
-    this energy and the width of the pulse; the width excludes the pulse.
+    Time and width are the first two moments of the deconvolved record within three quarters of an echo width about its
+    maximum near `bins`. The energy is its integral. Errors are those of a maximum-likelihood fit to one such echo, for
+    the given noise. The scatter after few iterations agrees with them within a fifth in time and energy; that of the
+    width is smaller, by up to three quarters. The amplitude belongs to an echo with this energy and the pulse width;
+    the width excludes the pulse.
 
-    The other arguments are the waveforms, the bins of the peaks and `EchoFlag` of the echoes, shape (n,), the shape of
-    an ideal echo, and the expected width of an echo in the records [ns].
+    The other arguments are the waveforms, peak bins and `EchoFlag` of the echoes, shape (n,), the ideal echo's shape,
+    and the expected echo width in the records [ns].
     """
     exists = has_echo(flags)
     deconvolved = Records(sharp, records.time_ns, records.noise)
@@ -165,7 +165,7 @@ def deconvolved_echo(
 
 
 def _fit_error(derivative: FloatArray, variance: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return the error, shape (n,), of a parameter fitted with weights 1/variance to samples of this noise."""
+    """Return a parameter's error, shape (n,), for samples with this noise fitted with weights 1/variance."""
     weight = derivative / variance
     information = np.sum(weight * derivative, axis=1)
     return np.asarray(np.sqrt(np.sum((weight * noise) ** 2, axis=1)) / np.maximum(information, 1e-300))

@@ -1,4 +1,4 @@
-"""Corrections of depths by the mean error that renders of the same instrument have."""
+"""Depth corrections by the mean error in renders of the same instrument."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _LEVEL = 1e-6  # largest difference of the heights of a level sea [m]
 
 
 def corrections_for(instrument: str, given: Given, name: str = "corrections") -> xr.Dataset:
-    """Return a table of corrections, as of `studies.depth_bias`: itself, of a file, or with ``auto`` the shipped one.
+    """Return a correction table, as from `studies.depth_bias`: itself, from a file, or with ``auto`` the shipped one.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def corrections_for(instrument: str, given: Given, name: str = "corrections") ->
 
 
 def correct_depths(found: Given, table: Given, wind_speed: float | None = None, turn_deg: float = 0.0) -> xr.Dataset:
-    """Subtract the mean errors of a table from the depths of bottoms and targets.
+    """Subtract a table's mean errors from bottom and target depths.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def correct_depths(found: Given, table: Given, wind_speed: float | None = None, 
     table : xarray.Dataset
         From `studies.depth_bias.depth_bias`, its file, or ``auto`` for the shipped one of the instrument.
     wind_speed : float, optional
-        Wind speed [m/s], at least 0, of a level sea that of its ripples; by default that of the result's scene. With 0,
+        Wind speed [m/s], at least 0; for a level sea the wind of its ripples. Defaults to the result's scene. With 0,
         the sea is level.
     turn_deg : float
         Angle by which the pixels are turned about the receiver's axis, from far to left [deg]; see `turned_pixels`.
@@ -89,23 +89,22 @@ def correct_depths(found: Given, table: Given, wind_speed: float | None = None, 
     Returns
     -------
     xarray.Dataset
-        The echoes with ``depth_m`` less the bias and ``depth_correction_m``, what was subtracted. Biases are
-        interpolated linearly in the angle from nadir, the wind or, of level seas, the inverse slope variance of the
-        ripples, the attenuation of the column (`usual_attenuation`) among columns as long, and the depth, as are
-        spreads. Outside the table they are those of its ends, but spreads that grow with the angle or the wind go on
-        growing. Where the column has no attenuation, the mean over the waters counts, each with the share of its
-        bottoms at this depth that are found, and depths of the table without attenuation alone; where it has one,
-        those with it. A bias counts with the share bias^2/(bias^2 + spread^2/n), for n places of a sea.
+        The echoes with ``depth_m`` less the bias and ``depth_correction_m``, what was subtracted. Biases and spreads
+        are interpolated linearly in angle from nadir, wind, attenuation and depth. For level seas the inverse slope
+        variance of ripples replaces the wind. The attenuation (`usual_attenuation`) is compared among columns as long.
+        Outside the table they are those of its ends, but spreads that grow with the angle or the wind go on growing.
+        Where the column has no attenuation, the mean over waters counts, each with its share of bottoms found at this
+        depth; only table depths without attenuation are used. Where it has one, only depths with it are used. A bias
+        counts with the share bias^2/(bias^2 + spread^2/n), for n places of a sea.
 
-        ``depth_m_method_error`` is the root of the sum of the squares of
+        ``depth_m_method_error`` is the root sum square of
 
-        - the spread in the table beyond the error by noise there, of waves with the mean over the waters; where the
-          error by noise exceeds the spread, ``depth_m_stderr`` is reduced to the spread;
-        - the error of the mean bias over n places of a sea with waves, or n renders of a level sea, spread/sqrt(n);
-        - the error of biases between nodes, and beyond the ends of the table, as of random walks: see Notes;
-        - the spread of the biases of the waters, where the column has no attenuation;
-        - the rounding of the surface's time to a bin of the render, the largest of the pixels; see
-          `depth_errors.rounding_ns`.
+        - the table's spread beyond its noise error, over waves with the mean over waters; where the noise error exceeds
+          the spread, ``depth_m_stderr`` is reduced to the spread;
+        - the error spread/sqrt(n) of the mean bias over n locations with waves, or n renders of a level sea;
+        - the bias error between nodes and beyond the table's ends, as for random walks: see Notes;
+        - the spread of biases over waters, where the column has no attenuation;
+        - the rounding of the surface time to a render bin, largest over the pixels; see `depth_errors.rounding_ns`.
 
     Raises
     ------
@@ -116,13 +115,13 @@ def correct_depths(found: Given, table: Given, wind_speed: float | None = None, 
     -----
     The linear interpolation of a random walk between nodes at the distances g and h has the variance rate times g h/(g
     + h), and beyond an end rate times g (kriging with a linear variogram; G. Matheron, Principles of geostatistics,
-    Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is the mean over the
-    cells of the lowest wind in which half of the shots have a depth: of the squared differences from the interpolation
-    between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.47 of their squared difference
-    over the distance, the mean ratio of both rates in eight tables (0.57 +- 0.12 in the shipped ones); one node gives
-    0, one wind of ripples 0.44 cm^2 for each unit of the inverse slope variance, the mean of the tables. Rates of winds
-    and ripples are less the variances of the means of places. Cells in which fewer of the shots have a depth count only
-    where no other ones do. Without any bias of an estimator in a pixel, depths and errors stay as they are.
+    Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is a mean over the
+    lowest-wind cells in which half of the shots have a depth. Each node is left out in turn; its squared difference
+    from the interpolated neighbours is divided by g h/(g + h). Two nodes give 0.47 of their squared difference over the
+    distance, the mean ratio of both rates in eight tables (0.57 +- 0.12 in the shipped ones); one node gives 0, one
+    wind of ripples 0.44 cm^2 for each unit of the inverse slope variance, the mean of the tables. Rates along wind and
+    ripples exclude the variance of location means. Cells in which fewer of the shots have a depth count only where no
+    other ones do. Without any bias of an estimator in a pixel, depths and errors stay as they are.
     """
     found = dataset_of("found", found, "echoes")
     instrument = str(found.attrs.get("instrument", ""))
@@ -209,7 +208,7 @@ def correct_depths(found: Given, table: Given, wind_speed: float | None = None, 
 
 
 def _learnt(table: xr.Dataset) -> xr.Dataset:
-    """Return a table with the biases that count, the variance of depths without noise, and the share of the noise.
+    """Return a table with the biases that count, the depth variance without noise, and the noise share.
 
     The variables added are ``variance`` [m^2], that of the mean bias included, and ``noise_share``.
     """
@@ -259,7 +258,7 @@ def turned_pixels(learnt: xr.Dataset, angle_x: FloatArray, angle_y: FloatArray, 
     learnt
         Table over ``pixel``, with the variables ``bias`` and ``variance`` [m^2].
     angle_x, angle_y
-        Centres of the pixels, away from nadir and to the left, in any unit, shape (pixels,).
+        Pixel centres, away from nadir and to the left, in any unit, shape (pixels,).
     turn_deg
         Angle from far to left [deg].
     """
@@ -283,7 +282,7 @@ def turned_pixels(learnt: xr.Dataset, angle_x: FloatArray, angle_y: FloatArray, 
 
 
 def _of_sea(learnt: xr.Dataset, wind: float, level: bool) -> xr.Dataset:
-    """Return a table at a wind or, of a level sea, at the wind of its ripples; a level sea is the one without wind."""
+    """Return a table at a wind or, for a level sea, at its ripples' wind; a level sea is the one without wind."""
     rows = learnt["wind_speed"].values == 0
     waves, ripples = learnt.isel(wind_speed=~rows), learnt["ripples"].values[rows]
     calm = learnt.isel(wind_speed=rows)
@@ -296,15 +295,15 @@ def _of_sea(learnt: xr.Dataset, wind: float, level: bool) -> xr.Dataset:
 
 
 def _calmness(winds: npt.ArrayLike) -> FloatArray:
-    """Return minus the inverse slope variances of ripples of winds [m/s], which ascend with these.
+    """Return minus the inverse ripple slope variances at winds [m/s]; they ascend with the winds.
 
-    The logarithm of the echo of a level surface is linear in it, and errors of depths follow this echo.
+    A level surface's log echo is linear in it, and depth errors follow this echo.
     """
     return np.array([-1 / sum(cox_munk(float(wind))) for wind in np.atleast_1d(winds)])
 
 
 def _between(table: xr.Dataset, axis: str, nodes: FloatArray, value: float) -> xr.Dataset:
-    """Return a table between the nodes of an axis, linearly; a cell that one of both lacks is that of the other.
+    """Interpolate a table linearly between an axis's nodes; where one node lacks a cell, the other's counts.
 
     Beyond its ends values are those of the ends, but ``deviation`` goes on linearly where it ascends outwards.
     """
@@ -321,7 +320,7 @@ def _between(table: xr.Dataset, axis: str, nodes: FloatArray, value: float) -> x
 
 
 def _walked_of_sea(table: xr.Dataset, wind: float, level: bool) -> float:
-    """Return g h/(g + h), as `_walked`, of a wind between those of the waves, or of the ripples of level seas."""
+    """Return g h/(g + h), as `_walked`, for a wind between the table's waves, or ripples for level seas."""
     rows = table["wind_speed"].values == 0
     nodes = table["ripples"].values[rows == level] if np.any(rows == level) else table["wind_speed"].values
     nodes = np.append(nodes, 0.0) if rows.any() and not level else nodes
@@ -329,11 +328,11 @@ def _walked_of_sea(table: xr.Dataset, wind: float, level: bool) -> float:
 
 
 def _walks(learnt: xr.Dataset, others: xr.Dataset, angle: float) -> dict[str, xr.DataArray]:
-    """Return the rates of the random walks of biases along the axes of a table [m^2 per unit], as `correct_depths`.
+    """Return random-walk rates of biases along a table's axes [m^2 per unit], as `correct_depths`.
 
-    All but that of ``water`` are over water; a water without them has the mean of the others, or that of the `others`,
-    columns of the other kind, 0 without any. Those of ``wind_speed`` and ``ripples`` are between the angles of the
-    table, less the variance of the means of places.
+    All but ``water`` are over water. A water without them has the others' mean, or the mean of `others`, columns of the
+    other kind, or 0. For ``wind_speed`` and ``ripples`` they are between the table's angles, minus the variance of
+    location means.
     """
 
     def of_lowest(table: xr.Dataset, axis: str) -> xr.DataArray:
@@ -389,10 +388,10 @@ def summarize_depths(found: xr.Dataset, truth: npt.ArrayLike) -> dict[str, Float
     Returns
     -------
     dict
-        ``found``, the share of shots with a depth; ``bias`` and ``spread``, mean error and its standard deviation,
-        of depths within 2 m; ``noise_error`` and ``error``, the medians of the stated error by noise, and of all;
-        ``z``, the root mean square of error over stated error; ``wrong``, the share of shots that err by more than
-        0.5 m without a flag.
+        ``found``, the share of shots with a depth; ``bias`` and ``spread``, mean error and its standard deviation, of
+        depths within 2 m; ``noise_error`` and ``error``, the median stated errors by noise and in all; ``z``, the root
+        mean square of error over stated error; ``wrong``, the share of shots that err by more than 0.5 m without a
+        flag.
     """
     bottom = found.sel(echo="bottom").transpose("shot", "pixel", "estimator")
     depth, noise, method = (bottom[name].values for name in ("depth_m", "depth_m_stderr", "depth_m_method_error"))
@@ -420,7 +419,7 @@ def summarize_depths(found: xr.Dataset, truth: npt.ArrayLike) -> dict[str, Float
 
 
 def usual_attenuation(attenuation: FloatArray, stderr: FloatArray) -> float:
-    """Return the mean attenuation of waveforms, of the same shape as its errors, weighted with their inverse squares.
+    """Return the waveforms' mean attenuation, shaped as its errors, weighted with their inverse squares.
 
     It is NaN where fewer than half of the waveforms have a column to measure it in. The weights leave out pixels that
     see too little of a short column.
@@ -432,7 +431,7 @@ def usual_attenuation(attenuation: FloatArray, stderr: FloatArray) -> float:
 
 
 def _opacity(found: xr.Dataset, depth: xr.DataArray) -> tuple[float, float]:
-    """Return the attenuation of the columns, NaN where it is not known, and the median depth of their bottoms [m]."""
+    """Return the column attenuation, NaN where unknown, and the median depth of the bottoms [m]."""
     values, stderr = (found[name].transpose("pixel", ...).values for name in ("attenuation", "attenuation_stderr"))
     bottom = depth.isel(estimator=0, echo=-1).values
     known = np.isfinite(bottom) & np.isfinite(values)
@@ -440,7 +439,7 @@ def _opacity(found: xr.Dataset, depth: xr.DataArray) -> tuple[float, float]:
 
 
 def _sea(found: xr.Dataset, given: float | None) -> tuple[float, bool]:
-    """Return the wind speed of a result's scene, or that of its ripples [m/s], and whether the sea is level."""
+    """Return the wind speed of a result's scene or ripples [m/s], and whether the sea is level."""
     lowest, highest = found.attrs.get("surface_heights_m", (math.nan, math.nan))
     level = bool(highest - lowest < _LEVEL) or given == 0
     if given is not None:
@@ -453,7 +452,7 @@ def _sea(found: xr.Dataset, given: float | None) -> tuple[float, bool]:
 
 
 def _shares(nodes: FloatArray, value: float) -> FloatArray:
-    """Return the weights of nodes in a linear interpolation, beyond the ends those of the ends; NaN is unknown."""
+    """Return node weights for linear interpolation, constant beyond the ends; NaN is unknown."""
     order = np.flatnonzero(np.isfinite(nodes))
     order = order[np.argsort(nodes[order])]
     if not order.size or np.isnan(value):
@@ -464,7 +463,7 @@ def _shares(nodes: FloatArray, value: float) -> FloatArray:
 
 
 def _walked(nodes: FloatArray, values: npt.ArrayLike) -> FloatArray:
-    """Return g h/(g + h) of values at the distances g and h from nodes, g beyond an end, and 0 of NaN."""
+    """Return g h/(g + h) for values at the distances g and h from nodes, g beyond an end, and 0 for NaN."""
     known = np.sort(nodes[np.isfinite(nodes)])
     if not known.size:
         return np.zeros(np.shape(values))
@@ -479,7 +478,7 @@ def _walked(nodes: FloatArray, values: npt.ArrayLike) -> FloatArray:
 def _along_depth(values: FloatArray, depths: FloatArray, at: FloatArray) -> FloatArray:
     """Return values, shape (water, depth), at depths of any shape, which stands after the waters.
 
-    They are linear between the known depths of a water, or those of the nearest water with any, and constant beyond.
+    They are linear between known depths, constant beyond; a water without any has the nearest water's.
     """
     known = np.isfinite(values)
     if not known.any():

@@ -39,49 +39,28 @@ HEIGHTS = 8.0
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Method errors of depths measured by Gaussian decomposition.
+    """Method errors of depths measured by Gaussian decomposition."""
 
-    Attributes
-    ----------
-    lines : LinesOfSight
-        Lines of sight with arrays of shape (n,), n waveforms, all pixels of a shot before the next shot.
-    shots : int
-        Number of shots.
-    beam_width
-        Diameter of the beam at e^-1/2 of its peak, or of the view if that is smaller, on the sea [m].
-    pulse_ns
-        Full width of an ideal echo at half maximum [ns].
-    refractive_index, group_index
-        Indices of the water.
-    slope
-        Standard deviation of the slopes averaged over a pixel [1], 0 for a level sea with ripples.
-    height
-        Standard deviation of the sea's height [m].
-    slope_variance
-        Variance of all slopes [1].
-    gain
-        Power of the column at the surface per backscattering coefficient [W m], NaN if unknown.
-    bin_ns
-        Width of the bins in which light was recorded before pulse and response [ns], 0 if it was not rendered.
-    """
-
+    #: Lines of sight with arrays of shape (n,), n waveforms, all pixels of a shot before the next shot.
     lines: LinesOfSight
-    shots: int
-    beam_width: float
-    pulse_ns: float
+    shots: int  #: Number of shots.
+    beam_width: float  #: Diameter of the beam at e^-1/2 of its peak, or of the view if that is smaller, on the sea [m].
+    pulse_ns: float  #: Full width of an ideal echo at half maximum [ns].
+    #: Indices of the water.
     refractive_index: float
     group_index: float
-    slope: float
-    height: float
-    slope_variance: float
-    gain: float
+    slope: float  #: Standard deviation of the slopes averaged over a pixel [1], 0 for a level sea with ripples.
+    height: float  #: Standard deviation of the sea's height [m].
+    slope_variance: float  #: Variance of all slopes [1].
+    gain: float  #: Power of the column at the surface per backscattering coefficient [W m], NaN if unknown.
+    #: Width of the bins in which light was recorded before pulse and response [ns], 0 if it was not rendered.
     bin_ns: float
 
     @classmethod
     def of(
         cls, attributes: Attributes, lines: LinesOfSight, shots: int, geometry: LidarGeometry, pulse_ns: float
     ) -> DepthErrors:
-        """Read the attributes of a result; without heights of the sea it has waves, without a beam a narrow one."""
+        """Read a result's attributes; without sea heights it has waves, without a beam a narrow one."""
         widths = [optional_number(attributes, f"{name}_mrad") for name in ("divergence", "field_of_view")]
         width = 1e-3 * geometry.slant_range * min((one for one in widths if one is not None), default=0.0)
         lowest, highest = attributes.get("surface_heights_m", (math.nan, math.nan))
@@ -93,11 +72,11 @@ class DepthErrors:
         return cls(lines, shots, width, pulse_ns, n, group, slope, height, variance, gain, bin_ns)
 
     def of_surface(self, faint: BoolArray) -> FloatArray:
-        """Return the errors of the times of surface echoes [ns], shape (n,).
+        """Return the time errors of surface echoes [ns], shape (n,).
 
-        The light of a surface echo comes from few places in the pixel, and its time is that of these places. Without a
-        distinct (`faint`) echo, it is that of the column's onset. Echo and column overlap by a pulse, which limits the
-        accuracy even of a narrow beam. `rounding_ns` is added.
+        A surface echo's light comes from few places in the pixel, which determine its time. Without a distinct
+        (`faint`) echo, it is that of the column's onset. Echo and column overlap by a pulse, which limits the accuracy
+        even of a narrow beam. `rounding_ns` is added.
         """
         share = np.where(faint, _OF_COLUMN, _OF_LEVEL_SURFACE if self.slope == 0 else _OF_WAVES)
         overlap = np.where(faint, _OF_LOST_PULSE, _OF_PULSE) * self.pulse_ns
@@ -105,7 +84,7 @@ class DepthErrors:
         return np.asarray(np.hypot(np.hypot(share * spread, overlap), rounding_ns(spread, self.bin_ns)))
 
     def of_land(self) -> FloatArray:
-        """Return the errors of the times of land [ns], shape (n,)."""
+        """Return the time errors of land [ns], shape (n,)."""
         return np.hypot(_OF_PULSE * self.pulse_ns, rounding_ns(self.lines.surface_spread, self.bin_ns))
 
     def of_echoes(
@@ -118,7 +97,7 @@ class DepthErrors:
         from_mean: bool,
         gated: bool = False,
     ) -> FloatArray:
-        """Return the errors of depths [m] except those of the surface times.
+        """Return the depth errors [m] without the surface time errors.
 
         Parameters
         ----------
@@ -133,14 +112,14 @@ class DepthErrors:
 
         Notes
         -----
-        Root of the sum of the squares of:
+        Root sum square of:
 
-        - the delay of scattered light, 0.09 sqrt(K bb) times the width of the beam, relative to the depth. The
-          backscattering bb follows from the level of the column, of a signal in volts it is 0.05 K;
+        - the delay of scattered light, 0.09 sqrt(K bb) times the beam width, relative to the depth. The backscattering
+          bb follows from the column level; for signals in volts it is 0.05 K;
         - the longer paths through ripples, 0.032 times the variance of the slopes, relative to the depth;
-        - light scattered from other pixels: 0.12 of the deviation of the arrival from that of all pixels, weighted with
-          the beam, or 0.2 in gates;
-        - the skew of an echo that is longer than the pulse because of the pixel's extent;
+        - light scattered from other pixels: 0.12 of the arrival's deviation from the beam-weighted mean over pixels, or
+          0.2 in gates;
+        - the skew of echoes that are longer than the pulse because the pixel is extended;
         - refraction by waves: a slope s turns the ray by s (1 - cos(theta)/(n cos(theta_w))), and the depth changes by
           tan(theta_w) times this angle, to first order;
         - from the mean sea level, the height h of the waves: the depth changes by h (1 - cos(theta_w)/(n_g
@@ -180,7 +159,7 @@ class DepthErrors:
         return np.asarray(np.hypot(below, away.reshape(-1, *(1,) * (depth.ndim - 1))) - below)
 
     def attenuation_times_backscattering(self, attenuation: FloatArray, level: FloatArray) -> FloatArray:
-        """Return K bb of the columns [1/m^2], shape (n,), with one bb for all pixels of a shot."""
+        """Return the columns' K bb [1/m^2], shape (n,), with one bb for all pixels of a shot."""
         known = np.where(np.isfinite(attenuation), np.maximum(attenuation, 0), _TYPICAL_ATTENUATION)
         share = self.lines.beam_share.reshape(self.shots, -1)
         power = level.reshape(share.shape)
@@ -195,7 +174,7 @@ class DepthErrors:
         return np.asarray(known * backscattering)
 
     def _from_all_pixels(self, time_ns: FloatArray) -> FloatArray:
-        """Return the deviations of arrivals from their mean over the pixels of a shot, weighted with the beam [ns].
+        """Return arrivals minus their beam-weighted mean over a shot's pixels [ns].
 
         They are limited to 1.5 pulses, beyond which echoes do not overlap.
         """
@@ -209,16 +188,16 @@ class DepthErrors:
 
 
 def rendered_bin_ns(attributes: Attributes) -> float:
-    """Return the width of the bins of a result's render [ns], 0 if unknown; those of a record may be wider."""
+    """Return the bin width of a result's render [ns], 0 if unknown; record bins may be wider."""
     widths = (optional_number(attributes, name) for name in ("rendered_bin_width_ns", "bin_width_ns"))
     return next((width for width in widths if width is not None), 0.0)
 
 
 def rounding_ns(spread_ns: npt.ArrayLike, bin_ns: float) -> FloatArray:
-    """Return the error of the time of light that is rendered into bins [ns], of the shape of its spread.
+    """Return the time error [ns] of light rendered into bins, shaped as its spread.
 
-    Light of a short spread s in one bin of the width w has the time of its middle: the error is w/sqrt(12), times
-    exp(-2 pi^2 (s/w)^2), as the error of the centroid of a Gaussian in bins.
+    Light with a short spread s in one bin of width w has the time of the bin's middle. The error is w/sqrt(12), times
+    exp(-2 pi^2 (s/w)^2), as for a binned Gaussian's centroid.
     """
     relative = np.asarray(spread_ns) / max(bin_ns, 1e-9)
     return np.asarray(bin_ns / math.sqrt(12) * np.exp(-2 * (math.pi * relative) ** 2))
@@ -230,10 +209,10 @@ def mean_slope(attributes: Attributes, width: float) -> float:
     Parameters
     ----------
     attributes
-        Attributes of a result; those of the sea are ``surface_slope_variance`` [1], by default 0.04, and
+        Attributes of a result. The sea's are ``surface_slope_variance`` [1], by default 0.04, and
         ``surface_heights_m``, two equal numbers for a level sea, whose slopes are 0.
     width
-        Diameter of the beam on the sea [m].
+        Beam diameter on the sea [m].
     """
     lowest, highest = attributes.get("surface_heights_m", (math.nan, math.nan))
     if highest - lowest < 1e-6:
@@ -243,7 +222,7 @@ def mean_slope(attributes: Attributes, width: float) -> float:
 
 
 def _slope_variance(attributes: Attributes) -> float:
-    """Return the variance of all slopes of the sea [1]."""
+    """Return the variance of all sea slopes [1]."""
     variance = optional_number(attributes, "surface_slope_variance")
     return TYPICAL_SLOPE_VARIANCE if variance is None else variance
 

@@ -1,4 +1,4 @@
-"""Classes of echoes: what is of the sea, what is land, and what stands above the water."""
+"""Echo classes: sea, land, and objects above the water."""
 
 from __future__ import annotations
 
@@ -56,23 +56,12 @@ class Detection(NamedTuple):
 
 @dataclass(frozen=True)
 class Decision:
-    """Echoes of n records whose first echoes are decided upon.
+    """Echoes of n records whose first echoes are decided upon."""
 
-    Attributes
-    ----------
-    found
-        The echoes; land, and bottoms without a surface, are the last ones.
-    above
-        Which of them stand above the water, shape (echoes, n).
-    probability
-        That of the class of the first echo, shape (n,); 1 where echoes are apart.
-    rows, first
-        Records whose first echo is land, or a bottom near its surface, and what is decided of them.
-    """
-
-    found: DetectedEchoes
-    above: BoolArray
-    probability: FloatArray
+    found: DetectedEchoes  #: The echoes; land, and bottoms without a surface, are the last ones.
+    above: BoolArray  #: Which of them stand above the water, shape (echoes, n).
+    probability: FloatArray  #: That of the class of the first echo, shape (n,); 1 where echoes are apart.
+    #: Records whose first echo is land, or a bottom near its surface, and what is decided of them.
     rows: IntArray
     first: FirstEchoes | None = None
 
@@ -96,7 +85,7 @@ class Decision:
         return replaced
 
     def surfaces(self) -> tuple[FloatArray, FloatArray]:
-        """Return time and error [ns] of surfaces without an echo of their own before a near bottom, NaN of others."""
+        """Return time and error [ns] of surfaces without their own echo before a near bottom, else NaN."""
         time, error = np.full((2, len(self.probability)), np.nan)
         if self.first is not None:
             own = np.isnan(self.first.surface.time_ns)
@@ -143,11 +132,11 @@ def decide(
     deviations behind its level. In the near infrared, where column and bottom are part of the surface's echo, a first
     echo is land or the surface, and nothing follows the surface.
 
-    Of 150 drawn records each (VQ-880-G II at nadir and 600 m, a level known to 0.15 m, glints from none to five times
-    the bottom's echo, reflectances 0.05 to 0.4), all land from 0.2 to 4 m is land, and 99 % of the bottoms from 0.3 to
-    4 m are found, none as land; the root mean square of error over stated error of their depths is 0.85
-    (`tests/unit/analysis/waveforms/test_echo_classes.py`). Within 0.1 m of the level, land and water without an echo of
-    the surface are told apart by the level alone, with probabilities of about one half.
+    150 records of each kind were drawn: VQ-880-G II at nadir and 600 m, a level known to 0.15 m, glints from none to
+    five times the bottom's echo, reflectances 0.05 to 0.4. All land from 0.2 to 4 m is land, and 99 % of the bottoms
+    from 0.3 to 4 m are found, none as land. Depth errors over stated errors have an rms of 0.85
+    (`tests/unit/analysis/waveforms/test_echo_classes.py`). Within 0.1 m of the level, only the level separates land
+    from water without a surface echo: probabilities are about one half.
 
     Parameters
     ----------
@@ -316,9 +305,9 @@ def _without_second_return(
 ) -> DetectedEchoes:
     """Return echoes without bottoms that are the light of a target which the surface has reflected, and so met twice.
 
-    Light that is totally reflected arrives from 2.34 times the depth on, where it is brightest: per pulse width w and
-    delay d at most 0.8 rho w/d of the bottom's echo. Without an echo the surface is in the bins `level`; of
-    targets within a number of `shallow` bins behind it.
+    Totally reflected light arrives from 2.34 times the depth on, where it is brightest: at most 0.8 rho w/d of the
+    bottom's echo per pulse width w and delay d. Without an echo the surface is in the bins `level`; for targets, within
+    `shallow` bins after it.
     """
     bins, flags = found.bins.copy(), found.flags.copy()
     surface = np.where(bins[0] >= 0, bins[0], level)
@@ -341,7 +330,7 @@ def _without_second_return(
 def _with_objects(
     found: DetectedEchoes, rows: IntArray, again: DetectedEchoes, most: int | None
 ) -> tuple[DetectedEchoes, BoolArray]:
-    """Return echoes, of which the first ones of some rows are objects, before those that were found again.
+    """Return echoes in which some rows start with objects, before echoes that were found again.
 
     Of `most` targets, the object takes the place of the last one.
     """

@@ -68,32 +68,21 @@ def has_echo(flags: IntArray) -> BoolArray:
 
 @dataclass(frozen=True)
 class Records:
-    """Waveforms with their noise.
+    """Waveforms with their noise."""
 
-    Attributes
-    ----------
-    power
-        Samples less the baseline, shape (n, time); any unit, W for energies in J.
-    time_ns
-        Centres of the bins [ns], evenly spaced, shape (time,).
-    noise
-        Standard deviation of each sample, independent between bins, shape (n, time) or (n, 1).
-    shared
-        Correlation of the samples, and the inflation of their noise to that of means over neighbours, where sums of
-        samples are not those of independent bins. None otherwise.
-    """
-
-    power: FloatArray
-    time_ns: FloatArray
-    noise: FloatArray
+    power: FloatArray  #: Samples less the baseline, shape (n, time); any unit, W for energies in J.
+    time_ns: FloatArray  #: Centres of the bins [ns], evenly spaced, shape (time,).
+    noise: FloatArray  #: Standard deviation of each sample, independent between bins, shape (n, time) or (n, 1).
+    #: Correlation of the samples, and the inflation of their noise to that of means over neighbours, where sums of
+    #: samples are not those of independent bins. None otherwise.
     shared: BlockCorrelation | None = None
 
     @classmethod
     def of(cls, waveforms: npt.ArrayLike, time_ns: npt.ArrayLike, noise: npt.ArrayLike = 0.0) -> Records:
         """Check waveforms, shape (n, time), at bin centres [ns], at least 8, evenly spaced and increasing.
 
-        The standard deviation of the samples, shape (), (n,) or (n, time), not negative, is at least a millionth of the
-        largest sample of the record, so that weights are finite. Invalid arrays raise `UserError`.
+        The samples' standard deviation, shape (), (n,) or (n, time), not negative, is at least a millionth of the
+        record's largest sample: weights are finite. Invalid arrays raise `UserError`.
         """
         power, time, sigma = (
             finite_array(name, values)
@@ -134,7 +123,7 @@ class Records:
         return replace(self, power=self.power[rows], noise=self.noise[rows])
 
     def time_of(self, bins: IntArray) -> FloatArray:
-        """Return the centres of bins [ns]; of bins outside the record, that of the nearest one inside."""
+        """Return bin centres [ns]; for bins outside the record, the nearest centre inside."""
         return np.asarray(self.time_ns[np.clip(bins, 0, self.time_ns.size - 1)])
 
     def places(self, bins: IntArray, lags: IntArray) -> IntArray:
@@ -152,7 +141,7 @@ class Records:
 
 
 def error_of_sums(scaled: FloatArray, places: IntArray | None, shared: BlockCorrelation | None) -> FloatArray:
-    """Return the standard errors of sums of samples, shape (n,).
+    """Return the standard errors of sample sums, shape (n,).
 
     Parameters
     ----------
@@ -172,7 +161,7 @@ def error_of_sums(scaled: FloatArray, places: IntArray | None, shared: BlockCorr
 
 @dataclass(frozen=True)
 class DetectedEchoes:
-    """Surface, targets and bottom of each record: bins of their peaks, -1 without an echo, and sums of `EchoFlag`.
+    """Surface, targets and bottom of each record: peak bins, -1 without an echo, and `EchoFlag` sums.
 
     The first target is the strongest one, and others follow by strength.
     """
@@ -186,7 +175,7 @@ class DetectedEchoes:
         return np.asarray(self.bins[0])
 
     def neighbours(self, echo: int) -> tuple[IntArray, IntArray]:
-        """Return the bins of the last echo before and of the first one behind an echo, -1 without one, shape (n,)."""
+        """Return the bins of the last echo before an echo and the first one after it, -1 without one, shape (n,)."""
         others = np.delete(self.bins, echo, axis=0)
         own, known = self.bins[echo], others >= 0
         before = np.max(np.where(known & (others < own), others, -1), axis=0)
@@ -196,10 +185,10 @@ class DetectedEchoes:
 
 @dataclass(frozen=True)
 class Echoes:
-    """Measured quantities of one echo of each record, NaN without an echo; shape (n,) each.
+    """Measured quantities of one echo per record, NaN without an echo; shape (n,) each.
 
-    Arrival [ns], height above the surrounding signal [unit of the record], integral over time [unit times s], full
-    width at half maximum [ns], their standard errors from the noise of the records, and sums of `EchoFlag`.
+    Arrival [ns], height above the surrounding signal [record's unit], integral over time [unit times s], and full width
+    at half maximum [ns]. Further their standard errors by record noise, and `EchoFlag` sums.
     """
 
     time_ns: FloatArray
@@ -260,16 +249,16 @@ def find_echoes(
 ) -> DetectedEchoes:
     """Find surface, target and bottom.
 
-    The surface echo is the first peak above the noise. Behind it, a peak exceeds the water column if the smoothed
-    signal w exceeds both w(t-d)^2/w(t-2d), extrapolated from the column before it, and sqrt(w(t-d) w(t+d)),
-    interpolated between both sides; or where w(t+2d) is below 0.8 w(t-d), as behind a bottom, w(t-d)^0.6 v^0.4 with
-    the mean v of w from t+d to t+2d. An exponential exceeds none: neither the column nor a step down in it is a peak.
-    Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, those
-    before it are targets; peaks below two thirds of what follows the last one are none. Peaks below a fiftieth of
-    the strongest are ignored, and of peaks less than an echo width apart the strongest counts. Behind the upper
-    edge of a turbid layer the signal does not fall back to the column above it: such a rise is no echo. Waves focus
-    the light of a shot, so that its column has peaks: below them, targets rise above the column by at least half of
-    it, and near the surface also of the column behind them.
+    The surface echo is the first peak above the noise. After it, a peak exceeds the water column if the smoothed signal
+    w exceeds two levels. The first, w(t-d)^2/w(t-2d), is extrapolated from the column before it; the second,
+    sqrt(w(t-d) w(t+d)), is interpolated. Where w(t+2d) is below 0.8 w(t-d), as after a bottom, the second is w(t-d)^0.6
+    v^0.4, with the mean v of w from t+d to t+2d. An exponential exceeds none: neither the column nor a step down in it
+    is a peak. Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom,
+    earlier ones are targets. Peaks below two thirds of what follows the last one are none. Peaks below a fiftieth of
+    the strongest are ignored; among peaks less than an echo width apart the strongest counts. Behind the upper edge of
+    a turbid layer the signal does not fall back to the column above it: such a rise is no echo. Waves focus a shot's
+    light, so that its column has peaks. Under waves, targets rise above the column by at least half of it, and near the
+    surface also above half the column after them.
 
     Parameters
     ----------
@@ -280,7 +269,7 @@ def find_echoes(
     threshold : float
         Detection threshold of the smoothed signal [standard deviations of the noise], above 0.
     contrast : float
-        Smallest excess of a peak behind the surface over the column, relative to the signal, 0 to 1.
+        Least excess over the column for peaks after the surface, relative to the signal, 0 to 1.
     earliest_ns : float
         Earliest time of the surface echo [ns]; before it only echoes above three thresholds count, which are land.
     latest_ns : array_like, shape () or (n,)
@@ -453,8 +442,8 @@ def _above_column(power: FloatArray, reach: int) -> tuple[FloatArray, FloatArray
 def _column_behind(power: FloatArray, noise: FloatArray, reach: int) -> FloatArray:
     """Return the column behind each sample, extrapolated to it from the lowest signals within one and two reaches.
 
-    It is at most the mean of the logarithms of the sample and of the lowest signal, so that the end of the column, or
-    of the record, is no steep decay.
+    It is at most the mean of two logarithms, the sample's and the lowest signal's. So the end of column or record is no
+    steep decay.
     """
     from scipy.ndimage import minimum_filter1d
 

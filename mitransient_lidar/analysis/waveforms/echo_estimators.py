@@ -29,28 +29,20 @@ _ENERGY_REACH = 1.5  # half the window of an energy, in echo widths
 
 @dataclass(frozen=True)
 class Window:
-    """Samples around one echo of each record, less the surrounding signal.
+    """Samples around one echo of each record, less the surrounding signal."""
 
-    Attributes
-    ----------
-    u, middle
-        Times from the middle bin of the echo [ns], shape (bins,), and times of the middle bins [ns], shape (n,).
-    power, noise, inside
-        Samples, their standard deviations, and whether they are inside the record; shape (n, bins).
-    ramps, level_noise
-        Weights of the levels before and after the echo in each sample, shape (2, bins), and their errors, shape (n, 2).
-    places, shared
-        Bins of the samples, shape (n, bins), and the correlation of their noise as of `Records`.
-    """
-
+    #: Times from the middle bin of the echo [ns], shape (bins,), and times of the middle bins [ns], shape (n,).
     u: FloatArray
     middle: FloatArray
+    #: Samples, their standard deviations, and whether they are inside the record; shape (n, bins).
     power: FloatArray
     noise: FloatArray
     inside: BoolArray
     bin_ns: float
+    #: Weights of the levels before and after the echo in each sample, shape (2, bins), and their errors, shape (n, 2).
     ramps: FloatArray
     level_noise: FloatArray
+    #: Bins of the samples, shape (n, bins), and the correlation of their noise as of `Records`.
     places: IntArray
     shared: BlockCorrelation | None
 
@@ -67,7 +59,7 @@ class Window:
         """Return the samples within 1.75 expected echo widths of the peaks in `bins`, shape (n,).
 
         With the bins of the preceding surface echoes `after`, shape (n,), a ramp as long as the echo is subtracted. It
-        connects the mean levels 1.5 to 2.5 echo widths before and after the echo; the level before it decays towards
+        connects the mean levels 1.5 to 2.5 echo widths before and after the echo. The level before it decays towards
         the echo as exp(-decay t) [1/ns], shape () or (n,).
         """
         half = max(int(np.ceil(1.75 * width / records.bin_ns)), 3)
@@ -84,7 +76,7 @@ class Window:
         return cls(u, middle, power, noise, inside, records.bin_ns, ramps, level_noise, places, records.shared)
 
     def error_of_sum(self, weights: FloatArray) -> FloatArray:
-        """Return the standard error, shape (n,), of the sum of the samples times `weights`, shape (n, bins)."""
+        """Return the standard error, shape (n,), for the samples' sum with `weights`, shape (n, bins)."""
         levels = np.sum((weights @ self.ramps.T * self.level_noise) ** 2, axis=1)
         scaled = np.where(self.inside, weights * self.noise, 0.0)
         return np.asarray(np.sqrt(error_of_sums(scaled, self.places, self.shared) ** 2 + levels))
@@ -120,7 +112,7 @@ def _levels(
 
 
 def summit(window: Window, flags: IntArray) -> Echoes:
-    """Return time, height, width and energy of a Gaussian through the summit of each echo.
+    """Return time, height, width and energy of a Gaussian through each echo's summit.
 
     The logarithm of the samples above half the peak is fitted by a parabola with weights (model/noise)^2, iterated from
     (sample/noise)^2 (Guo 2011, IEEE Signal Process. Mag. 28(5), 134-137), which is exact for a Gaussian.
@@ -200,22 +192,22 @@ def _nearest(window: Window, centre: FloatArray, width: FloatArray) -> IntArray:
 
 
 def gate_energy(window: Window, centre_ns: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
-    """Return the energy of each echo within 1.5 widths [ns] of it, and its error [unit times s], shape (n,)."""
+    """Return each echo's energy within 1.5 widths [ns], and its error [unit times s], shape (n,)."""
     share = _share(window, centre_ns, _ENERGY_REACH * width)
     seconds = window.bin_ns * 1e-9
     return np.sum(share * window.power, axis=1) * seconds, window.error_of_sum(share) * seconds
 
 
 def _share(window: Window, centre_ns: FloatArray, half: float) -> FloatArray:
-    """Return the fraction of each bin within half a width of a centre, shape (n, bins)."""
+    """Return each bin's fraction within half a width of a centre, shape (n, bins)."""
     distance = np.abs(window.middle[:, np.newaxis] + window.u - centre_ns[:, np.newaxis])
     return np.where(window.inside, np.clip(0.5 + (half - distance) / window.bin_ns, 0, 1), 0)
 
 
 def centroid(window: Window, centre: FloatArray, half: float) -> tuple[FloatArray, FloatArray]:
-    """Return the centroid of each echo [ns] within half a width [ns] of itself, and its standard error, shape (n,).
+    """Return each echo's centroid [ns] within half a width [ns] of itself, and its standard error, shape (n,).
 
-    It is NaN for a first guess `centre` of NaN, and for a sum of samples that is not positive.
+    It is NaN for a first guess `centre` of NaN, and where the samples' sum is not positive.
     """
     time = window.middle[:, np.newaxis] + window.u
     for _ in range(8):
@@ -238,8 +230,8 @@ def crossing(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the arrival of each echo from the time at which its leading edge crosses a level.
 
-    The crossing is that of a line through the logarithms with the curvature of the summit's Gaussian, plus the time of
-    the pulse from that level to its arrival: the time of an echo longer than the pulse is too early.
+    A line through the logarithms, curved like the summit's Gaussian, crosses the level. The pulse's time from that
+    level to its arrival is added: echoes longer than the pulse are too early.
 
     Parameters
     ----------
@@ -306,13 +298,13 @@ def crossing(
 def leading_edge(
     window: Window, top: Echoes, template: Template, fraction: float = 0.5
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the arrival of each echo from its edge at a fraction of its height; see `crossing`."""
+    """Return each echo's arrival from its edge at a fraction of its height; see `crossing`."""
     level = np.where(np.isfinite(top.amplitude), fraction * top.amplitude, -1.0)
     return crossing(window, top, level, fraction * top.amplitude_stderr, template)
 
 
 def ideal_echo(template: Template, bin_ns: float, echo_fwhm_ns: float) -> tuple[Records, IntArray]:
-    """Return a record without noise of an ideal echo that arrives at 0, and the bin of its peak."""
+    """Return an ideal echo's noise-free record with arrival at 0, and its peak bin."""
     half = int(np.ceil(max(-template.time_ns[0], template.time_ns[-1], 2 * echo_fwhm_ns) / bin_ns)) + 8
     time = np.arange(-half, half + 1) * bin_ns
     shape = np.interp(time, template.time_ns, template.power, left=0, right=0)[np.newaxis]
@@ -322,7 +314,7 @@ def ideal_echo(template: Template, bin_ns: float, echo_fwhm_ns: float) -> tuple[
 def calibrate(
     time_of: Callable[[Window, Echoes], tuple[FloatArray, FloatArray]], template: Template, bin_ns: float, width: float
 ) -> float:
-    """Return the bias of an estimator [ns], its time of an ideal echo that arrives at 0."""
+    """Return an estimator's bias [ns]: its time for an ideal echo that arrives at 0."""
     records, place = ideal_echo(template, bin_ns, width)
     window = Window.around(records, place, width)
     return float(time_of(window, summit(window, np.zeros(1, dtype=np.intp)))[0][0])

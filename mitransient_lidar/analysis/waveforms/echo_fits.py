@@ -52,36 +52,35 @@ def gaussian_surface(
     """Fit a surface echo together with the water column that begins at it.
 
     The model is A E(u) plus a column C F(u) exp(-k (u - p)) from u = 0 on, blurred by E. Here u is the time since the
-    surface, p that of an echo with the found peak, E the shape of an ideal echo, blurred by a Gaussian of free width,
-    and F the focusing of light by waves.
-    It is fitted from two echo widths before the peak to two after it, and determines the surface even where the peak is
-    that of the column. Amplitude, energy and width are those of A E. The focusing of a single shot differs from its
-    mean: over waves, samples that are later than an echo width behind the rise to C / 2 have a relative error of 0.8,
-    unless the peak is above 10 C.
+    surface, and p the time for an echo with the found peak. E is the ideal echo shape, blurred by a Gaussian with free
+    width, and F the focusing by waves. It is fitted from two echo widths before the peak to two after it, and
+    determines the surface even where the peak is that of the column. Amplitude, energy and width are those of A E. A
+    single shot's focusing differs from its mean. Over waves, samples later than an echo width after the rise to C / 2
+    therefore have a relative error of 0.8, unless the peak is above 10 C.
 
     A surface echo that is weak relative to the column is fitted nearly as well without A, one or two nanoseconds
     earlier. Where A lowers the squared residuals by less than 9, the result is the mean over fits with fixed A, 0 to
-    0.45 of the peak, weighted with their likelihood and a prior probability of one half for A = 0; the errors include
-    the spread of these fits. Over waves, where it is within half an echo width of the earliest time that the samples
-    about the peak allow, the peak is too deep in the column for the surface, which is not found. Over waves, an A E
-    wider than two echo widths is light of the column, and does not count.
+    0.45 times the peak. Weights are their likelihood and a prior probability of one half for A = 0; errors include the
+    spread. Over waves, it may lie within half an echo width of the earliest time that samples about the peak allow.
+    Then the peak is too deep in the column, and no surface is found. Over waves, an A E wider than two echo widths is
+    light of the column, and does not count.
 
     Parameters
     ----------
     records, bins, flags : Records and ndarray of int, shape (n,)
-        The waveforms, and the bins of the surface peaks and `EchoFlag` of the echoes.
+        The waveforms, the surface peak bins, and the echoes' `EchoFlag`.
     width : float
-        Expected full width of the echo at half maximum [ns].
+        Expected full echo width at half maximum [ns].
     decay : array_like, shape () or (n,)
-        Rate k of decay of the column [1/ns], above 0, as fitted behind the echo or typical.
+        Column decay rate k [1/ns], above 0, as fitted after the echo or typical.
     shape : EchoShape
         Shape of an ideal echo.
     column : ColumnOnset, optional
-        Blurred form of F; by default that of F = 1.
+        Blurred form of F; by default for F = 1.
     level : (ndarray, ndarray), shape (n,) each, optional
         C from the column behind the echo, extrapolated to the peak, and its standard error; NaN where it is not known.
     reflects : bool
-        Whether the surface may send light back; otherwise A is 0, and the time that of the onset of the column.
+        Whether the surface may send light back; otherwise A is 0, and the column's onset is the time.
     decay_error : array_like, shape () or (n,)
         Standard error of the logarithm of k.
     following : ndarray of int, shape (n,), optional
@@ -181,11 +180,11 @@ def gaussian_echo(
 ) -> Echoes:
     """Fit an echo at which the column ends.
 
-    The model is A E(u) plus a column exp(-k u) with one level before and another one behind the echo and a step between
-    them that is blurred like the echo. It is fitted from two echo widths before the peak to one and a half after it,
-    without samples less than an echo width behind the surface peaks in the bins `after`, shape (n,), and nearer to
-    the echoes before and behind it in the bins `around`, each of shape (n,) and -1 without one. The other arguments are
-    those of `gaussian_surface`.
+    The model is A E(u) plus a column exp(-k u). The column has one level before and one after the echo; the step
+    between them is blurred like the echo. It is fitted from two echo widths before the peak to one and a half after it.
+    Samples less than an echo width after the surface peaks in bins `after`, shape (n,), are left out. So are samples
+    nearer to the echoes before and after it, in bins `around`, each of shape (n,) and -1 without one. The other
+    arguments are those of `gaussian_surface`.
     """
     data = Windows.of(records, bins, width, decay, (-2, 1.5), shape)
     if after is not None:
@@ -230,8 +229,8 @@ def gaussian_echo(
 class Windows:
     """Samples about the peaks: times from them (bins,), samples and noise (n, bins), and decay rates (n, 1).
 
-    Times count from the arrival of an ideal echo whose peak is in the bin of the peak; `earliest` is the first one that
-    a fit may find. Parameters may be `known`, with their standard errors, shape (n,); NaN where they are not.
+    Times count from an ideal echo's arrival with its peak in the peak bin; `earliest` is the first one that a fit may
+    find. Parameters may be `known`, with their standard errors, shape (n,); NaN where they are not.
     """
 
     u: FloatArray
@@ -264,10 +263,10 @@ class Windows:
         return cls(u, power, noise, inside, rate, width, shape, -1.2 * width)
 
     def about_rise(self, level: FloatArray) -> tuple[Windows, FloatArray]:
-        """Return the samples with the uncertainty of the focusing, and the times of the rises of columns with a level.
+        """Return the samples with focusing uncertainty, and the rise times of columns with a level.
 
-        Samples later than a width behind the rise are uncertain, unless their peak is far above the column. The time of
-        such a peak, and that of a column without a level, is NaN.
+        Samples later than a width behind the rise are uncertain, unless their peak is far above the column. The time is
+        NaN for such a peak, and for a column without a level.
         """
         known = np.isfinite(level) & (level > 0)
         height = np.where(known, level, np.inf)[:, np.newaxis]
@@ -280,7 +279,7 @@ class Windows:
         return replace(self, noise=noise), np.where(rises, first - self.shape.peak_ns, np.nan)
 
     def limits(self, scale: FloatArray, size: int) -> Limits:
-        """Return the limits of echoes of a scale, shape (n,), with so many parameters."""
+        """Return the limits for echoes at a scale, shape (n,), with so many parameters."""
         lowest, highest = np.full(size, -np.inf), np.full(size, np.inf)
         lowest[:3] = self.earliest, self.shape.least_sigma, 0
         highest[:2] = 1.2 * self.width, self.shape.sigma_of(3 * self.width)
@@ -340,7 +339,7 @@ def _mean(tried: list[WindowFits]) -> WindowFits:
 
 
 class Limits(NamedTuple):
-    """Least and largest values of the parameters of fits, and their units; shape (p,) or (n, p) each."""
+    """Least and largest values of fit parameters, and their units; shape (p,) or (n, p) each."""
 
     lowest: FloatArray
     highest: FloatArray
@@ -358,8 +357,8 @@ def fit_windows(
 ) -> WindowFits:
     """Fit a model to many windows at once by damped least squares (Levenberg and Marquardt).
 
-    Heights, the third parameters, that are not NaN in `held`, shape (n,), are fixed. Without limits the parameters are
-    those of echoes: time, standard deviation, and heights in units of `scale`.
+    Heights, the third parameters, that are not NaN in `held`, shape (n,), are fixed. Without limits, echo parameters
+    are meant: time, standard deviation, and heights in units of `scale`.
     """
     u, power, usable, rate = data.u, data.power, data.usable, data.rate
     count, size = start.shape
@@ -439,7 +438,7 @@ def fit_windows(
 
 @dataclass(frozen=True)
 class _Prior:
-    """Known values (n, k) of k parameters of the fits, and the inverse of their standard errors, 0 where not known."""
+    """Known values (n, k) for k fit parameters, and their inverse standard errors, 0 where not known."""
 
     index: list[int]
     mean: FloatArray
@@ -454,7 +453,7 @@ class _Prior:
         return cls(index, np.where(usable, mean, 0), np.where(usable, 1 / np.where(usable, error, 1), 0))
 
     def cost(self, values: FloatArray, rows: IntArray) -> FloatArray:
-        """Return the squared residuals of some of the fits."""
+        """Return the squared residuals of some fits."""
         return np.asarray(np.sum((self.weight[rows] * (values[rows][:, self.index] - self.mean[rows])) ** 2, axis=1))
 
 

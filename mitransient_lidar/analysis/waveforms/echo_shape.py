@@ -1,4 +1,4 @@
-"""Shape of an ideal echo in a record: the pulse after bins and receiver, and its sum of Gaussians for fits.
+"""Ideal echo shape in a record: the pulse after bins and receiver, and its sum of Gaussians for fits.
 
 All estimators give the same time for an echo with this shape: their bias for it is subtracted.
 """
@@ -22,7 +22,7 @@ _BLURS, _BEYOND = 24, 4.0  # blurs of a table of pulses, and the reach of a Gaus
 
 @dataclass(frozen=True)
 class Response:
-    """Response of a receiver to the light of one bin: weights of the bins of light in a sample, of unit sum."""
+    """Receiver response to light in one bin: weights of the light bins in a sample, with unit sum."""
 
     first: int  #: Bins from the light of the first weight to the sample; negative for later light.
     weights: FloatArray
@@ -63,7 +63,7 @@ class Template:
         return cls(time, power, float(fall - rise))
 
     def kernel(self, bin_width_ns: float) -> tuple[int, FloatArray]:
-        """Return the first lag and the weights, of unit sum, of an echo in samples at a distance [ns]."""
+        """Return an echo's first lag and weights (unit sum) in samples at a distance [ns]."""
         first = int(np.ceil(self.time_ns[0] / bin_width_ns))
         lags = np.arange(first, int(np.floor(self.time_ns[-1] / bin_width_ns)) + 1)
         weights = np.interp(lags * bin_width_ns, self.time_ns, self.power)
@@ -71,7 +71,7 @@ class Template:
 
     @property
     def peak_ns(self) -> float:
-        """Time of the peak [ns], the middle of equal samples."""
+        """Peak time [ns], the middle of equal samples."""
         top = np.flatnonzero(self.power >= self.power.max() * (1 - 1e-9))
         return float(0.5 * (self.time_ns[top[0]] + self.time_ns[top[-1]]))
 
@@ -95,18 +95,12 @@ class Template:
 
 @dataclass(frozen=True)
 class EchoShape:
-    """A template as a sum of Gaussians of one width, whose blurred form is of the same kind.
+    """A template as a sum of equally wide Gaussians, whose blurred form is of the same kind."""
 
-    Attributes
-    ----------
-    delays, heights
-        Times of the Gaussians from the arrival [ns], and their heights, shape (terms,); the sum is 1 at the peak.
-    sigma, fwhm_ns, peak_ns
-        Standard deviation of the Gaussians, full width at half maximum of the sum, and time of its peak [ns].
-    """
-
+    #: Times of the Gaussians from the arrival [ns], and their heights, shape (terms,); the sum is 1 at the peak.
     delays: FloatArray
     heights: FloatArray
+    #: Standard deviation of the Gaussians, full width at half maximum of the sum, and time of its peak [ns].
     sigma: float
     fwhm_ns: float
     peak_ns: float
@@ -118,7 +112,7 @@ class EchoShape:
 
     @classmethod
     def of(cls, template: Template) -> EchoShape:
-        """Return a Gaussian of the width of a template, or a sum of narrower ones, that is within 1 % of its peak.
+        """Return a Gaussian as wide as a template, or a sum of narrower ones, to within 1 % of its peak.
 
         The heights are fitted with least squares and not negative, for the largest width that is close enough.
         """
@@ -143,7 +137,7 @@ class EchoShape:
 
     @property
     def terms(self) -> list[tuple[float, float, float]]:
-        """Delay [ns], height, and share of the area of each Gaussian."""
+        """Delay [ns], height, and area share of each Gaussian."""
         shares = self.heights / self.heights.sum()
         return list(zip(self.delays.tolist(), self.heights.tolist(), shares.tolist(), strict=True))
 
@@ -153,7 +147,7 @@ class EchoShape:
         return 0.1 * self.sigma if self.delays.size == 1 else 0.9 * self.sigma
 
     def sigma_of(self, fwhm_ns: float) -> float:
-        """Return the standard deviation [ns] of the Gaussians of an echo of a full width at half maximum [ns]."""
+        """Return the Gaussians' standard deviation [ns] for an echo's full width at half maximum [ns]."""
         return float(np.sqrt(max(self._extra(fwhm_ns, self.fwhm_ns) + self.sigma**2, self.least_sigma**2)))
 
     def width_of(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -163,7 +157,7 @@ class EchoShape:
         return width, FWHM_PER_SIGMA**2 * sigma / width
 
     def top_of(self, sigma: FloatArray) -> FloatArray:
-        """Return the height of the peak for standard deviations of the Gaussians, shape (n,)."""
+        """Return the peak height for standard deviations of the Gaussians, shape (n,)."""
         if self.delays.size == 1:
             return np.ones_like(sigma)
         time = np.linspace(self.delays[0], self.delays[-1], max(8 * self.delays.size, 32))
@@ -178,21 +172,13 @@ class EchoShape:
 
 @dataclass(frozen=True)
 class BlurredPulse:
-    """A template that is blurred by Gaussians, and its integral over time, from tables.
+    """A template that is blurred by Gaussians, and its integral over time, from tables."""
 
-    Attributes
-    ----------
-    start_ns, step_ns
-        First time of the tables and their step [ns].
-    variances
-        Variances of the Gaussians [ns^2], ascending from 0, denser near it.
-    power, slope, integral
-        Shape with the area of the template, its derivative by time [1/ns] and its integral [ns]; shape (variances, n).
-    """
-
+    #: First time of the tables and their step [ns].
     start_ns: float
     step_ns: float
-    variances: FloatArray
+    variances: FloatArray  #: Variances of the Gaussians [ns^2], ascending from 0, denser near it.
+    #: Shape with the area of the template, its derivative by time [1/ns] and its integral [ns]; shape (variances, n).
     power: FloatArray
     slope: FloatArray
     integral: FloatArray

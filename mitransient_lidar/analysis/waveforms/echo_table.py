@@ -1,4 +1,4 @@
-"""Tables of the surface, column, target and bottom echoes of every pixel and shot."""
+"""Tables of surface, column, target and bottom echoes for every pixel and shot."""
 
 from __future__ import annotations
 
@@ -83,39 +83,39 @@ def extract(
         A result with ``waveform`` [W], or a receiver's record with ``signal``, which takes precedence; over (pixel,
         time) or (row, column, time), optionally after ``shot``. A signal after a logarithm (attributes
         ``receiver.logarithm.volts_per_decade`` and ``.knee_v`` of `receiver.detect_waveforms`) is expanded to the
-        voltage before it, the unit of all quantities.
+        voltage before it. All quantities have its unit.
     estimators : str or sequence of str
-        Estimators of time: ``threshold`` (the leading edge crosses `threshold` standard deviations of the noise, at
-        least a fiftieth of the echo), ``leading_edge`` (it crosses half the amplitude), ``peak`` (Gaussian through the
-        summit), ``centroid``, ``gaussian`` (decomposition into Gaussians and the column, which alone separates the
-        surface from the column), or ``deconvolution`` (Richardson-Lucy).
+        Estimators of time: ``threshold`` (the leading edge crosses `threshold` noise standard deviations, at least a
+        fiftieth of the echo), ``leading_edge`` (it crosses half the amplitude), ``peak`` (Gaussian through the summit),
+        ``centroid``, ``gaussian`` (decomposition into Gaussians and column), or ``deconvolution`` (Richardson-Lucy).
+        Only ``gaussian`` separates the surface from the column.
     pulse : Pulse, optional
-        The transmitted pulse. By default, that of the attributes ``pulse_times_ns`` and ``pulse_power``, or a Gaussian
-        of ``pulse_fwhm_ns``.
+        The transmitted pulse. By default, the attributes ``pulse_times_ns`` and ``pulse_power``, or a Gaussian with
+        ``pulse_fwhm_ns``.
     noise : float or array-like, optional
-        Standard deviation of the samples: a number, or one per pixel, or per pixel and bin. By default,
-        ``waveform_stderr`` with the ``error_correlation``, or ``signal_deviation``, or the spread before the surface
-        echo. For a signal it is at least this spread, times the ratio of the standard deviation of means over a pulse
-        to that of independent bins, from at least 20 shots, or else before the surface echo; and it includes
-        ``signal_mean_stderr``, so that errors of a render are no echoes.
+        Sample standard deviation: a number, or one per pixel, or per pixel and bin. By default, ``waveform_stderr``
+        with the ``error_correlation``, or ``signal_deviation``, or the spread before the surface echo. For a signal it
+        is at least this spread, times an inflation: standard deviation of means over a pulse to the one for independent
+        bins, from at least 20 shots, or else before the surface echo. It includes ``signal_mean_stderr``, so that
+        render errors are no echoes.
     echo_fwhm_ns : float, optional
-        Expected full width of an echo [ns]. By default, that of pulse, response and the beam's spread over the surface.
+        Expected full width of an echo [ns]. By default, from pulse, response and the beam's spread over the surface.
     saturation_level : float, optional
         Smallest saturated sample, as recorded, in addition to the variable ``saturated``.
     depth_from : {'echo', 'mean'}
-        Depths from the surface echo of each waveform, or from the mean sea level along the pixel's line of sight.
+        Depths from each waveform's surface echo, or from the mean sea level along the pixel's line of sight.
     level : SurfaceLevel, optional
-        Arrival of the surface in each waveform as known without it, NaN where it is not, for land and very shallow
-        water, and for depths as far as it is known better than by the waveform. By default that of the infrared channel
+        Surface arrival in each waveform as known without it, NaN where unknown. It serves land and very shallow water,
+        and depths as far as it is better known than by the waveform. By default the infrared channel's level
         (`surface_times.infrared_level`), or else the mean sea level, with an error of 0.15 m and the waves. Where a
-        first echo is uncertain, and eight or more waveforms have a column below a certain surface, the median of these
-        surfaces replaces it (`surface_times.SurfaceLevel.of_neighbours`).
+        first echo is uncertain, the median surface of eight or more waveforms with certain surfaces above a column
+        replaces it (`surface_times.SurfaceLevel.of_neighbours`).
     iterations : int
-        Iterations of the deconvolution, 1 to 10 000.
+        Deconvolution iterations, 1 to 10 000.
     block : int
-        Number of waveforms in memory at a time, at least 1.
+        Waveforms in memory at a time, at least 1.
     targets : int, optional
-        Number of targets that the table has, 1 to 100; by default that of the waveform with most, at least 1.
+        Targets in the table, 1 to 100; by default as many as the waveform with most, at least 1.
 
     Returns
     -------
@@ -139,39 +139,39 @@ def extract(
 
     Notes
     -----
-    Depth is (t - t_surface) c0 cos(theta_water) / (2 n_g), with the angle of the pixel's line of sight; see
-    `geometry.LinesOfSight`. Time, depth and energy of the column are those of the samples between the surface echo and
-    the next one, its amplitude is extrapolated to the surface, and its width is the time of decay to one half.
+    Depth is (t - t_surface) c0 cos(theta_water) / (2 n_g), with the pixel's line-of-sight angle; see
+    `geometry.LinesOfSight`. Column time, depth and energy come from the samples between the surface echo and the next
+    one. The amplitude is extrapolated to the surface; the width is the decay time to one half.
 
-    An ideal echo has the shape of the pulse after bins and responses, of signals the ``receiver_response``, too.
-    ``gaussian`` fits sums of Gaussians of this shape; the column behind the surface has the mean focusing of light by
-    waves that the result states (``wave_focusing``). Later than the lowest point of the sea there is no surface echo.
+    An ideal echo is shaped like the pulse after bins and responses; for signals after ``receiver_response``, too.
+    ``gaussian`` fits Gaussian sums with this shape. The column after the surface has the mean wave focusing that the
+    result states (``wave_focusing``). Later than the lowest point of the sea there is no surface echo.
 
     Surface echoes are held against beam and geometry; see `surface_times.surface_times`. A pixel without direct light
     has the flag ``no_surface_light``, ``surface_time_ns`` from the other pixels of its shot, and echoes with the flag
     ``scattered_light``. Echoes no higher than single events of the detector are ``few_events``. ``gaussian`` flags
-    targets and bottoms below 3 standard errors as ``poor_fit``, and surfaces as ``column_onset``: their time is that of
-    the column's onset, as of all beyond 60 degrees from nadir. They have neither amplitude nor width.
+    targets and bottoms below 3 standard errors as ``poor_fit``, and surfaces as ``column_onset``. The latter have the
+    time of the column's onset, like all beyond 60 degrees from nadir. They have neither amplitude nor width.
 
     Saturated samples do not count for ``gaussian`` and the column: an echo may be anywhere in the clipped time. Light
     that a bottom returns twice arrives from twice its depth: where the half depth is clipped, an echo is ``saturated``,
     too, and has this half as an error. ``depth_m_stderr`` is the error by noise, by saturation, and by the jitter of
     the record's trigger and clocks, which cancels where the pixel's own surface echo counts. The method errs by more:
-    ``depth_m_method_error`` states for ``gaussian`` the typical error by scattered light that arrives later, by the
-    light's distribution in the pixel, which the surface echo samples at few places, and by waves; see
+    For ``gaussian``, ``depth_m_method_error`` states the typical error by waves, by scattered light that arrives later,
+    and by the light distribution in the pixel, which the surface echo samples at few places; see
     `depth_errors.DepthErrors`. Its constants are from 40 random level seas and 36 shots on waves, its dependence on
-    sqrt(K bb) also from one lidar. In other renders the root mean squares of error over both errors together were 1.0
-    to 1.2: seven hexagonal pixels over level and tilted bottoms in six waters, imagers of 32x32 and 128x128 pixels over
-    a slope of 8 degrees, and 60 shots at 6 m/s (1.0 to 1.3 in each 20 of them). The error has the sign of the biases
-    below: over bottoms that rise away from the lidar by 8 to 10 degrees the ratio was 1.2 to 1.4, over falling ones 0.7
-    to 0.8. The other estimators have the biases below.
+    sqrt(K bb) also from one lidar. In other renders the rms error over both errors together was 1.0 to 1.2. They were
+    seven hexagonal pixels over level and tilted bottoms in six waters, 32x32 and 128x128 imagers over a slope of 8
+    degrees, and 60 shots at 6 m/s (1.0 to 1.3 in each 20 shots). The error has the sign of the biases below. Over
+    bottoms that rise away from the lidar by 8 to 10 degrees the ratio was 1.2 to 1.4, over falling bottoms 0.7 to 0.8.
+    The other estimators have the biases below.
 
-    Biases by method over a flat bottom, measured with three renders each of ``table1`` with 1x1 pixels, ``spectrum``
-    flat and bins of 0.5 ns; positive is too deep [m]. The first number of each pair is that of the surface, the second
-    that of the bottom against the mean sea level (`depth_from` ``mean``); with ``echo`` they add up. Angles are in
-    degrees, d is the divergence [mrad], in a field of view of 20 mrad for 2 and 30 mrad for 10. Attenuation, scattering
-    and backscattering [1/m] and depth [m] are 0.15, 0.08, 0.0015 and 8 (clear), 0.3, 0.15, 0.006 and 8 (coastal), and
-    1, 0.8, 0.016 and 4 (turbid). Standard errors are at most 0.013, those of ``peak`` up to 0.1.
+    Biases by method over a flat bottom, from three renders each: ``table1`` with 1x1 pixels, ``spectrum`` flat and 0.5
+    ns bins. Positive is too deep [m]. In each pair, the first number is the surface bias, the second the bottom bias
+    against the mean sea level (`depth_from` ``mean``); with ``echo`` they add up. Angles are in degrees; d is the
+    divergence [mrad], with 20 mrad fields of view for 2 and 30 mrad for 10. Attenuation, scattering and backscattering
+    [1/m] and depth [m] are 0.15, 0.08, 0.0015 and 8 (clear), 0.3, 0.15, 0.006 and 8 (coastal), and 1, 0.8, 0.016 and 4
+    (turbid). Standard errors are at most 0.013, those of ``peak`` up to 0.1.
 
     ======= ===== == =========== =========== =========== =========== =========== ===========
     water   angle  d threshold   edge        peak        centroid    gaussian    deconvolved
@@ -196,12 +196,12 @@ def extract(
     turbid     40 10   -   -0.64   -   -0.36   -   +0.27   -   +0.34 +0.03 +0.12 -1.02 -0.23
     ======= ===== == =========== =========== =========== =========== =========== ===========
 
-    In water that only absorbs, all methods but threshold and edge have surface biases of at most 0.06, as near facets
-    return most of the light, and bottom biases of at most 0.01, up to 20 degrees; edges of wide echoes are early. The
-    rest is the water's: light scattered near the surface follows the surface echo and delays its peak and centroid by
-    0.1 to 1.8 (surface penetration), and scattered light reaches the bottom later by 0.02 to 0.1. It arrives no earlier
-    than direct light (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo. The
-    attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction.
+    In water that only absorbs, up to 20 degrees, all methods but threshold and edge have surface biases up to 0.06, as
+    near facets return most light. Bottom biases reach 0.01; edges of wide echoes are early. The water causes the rest.
+    Light scattered near the surface follows the surface echo and delays its peak and centroid by 0.1 to 1.8 (surface
+    penetration). Scattered light reaches the bottom 0.02 to 0.1 later. It arrives no earlier than direct light
+    (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo. The attenuation K is that
+    of exp(-2 K s) over the path s, corrected for distance and refraction.
     """
     dataset, infrared = split(dataset_of("dataset", dataset, "waveforms", "signals"))
     check_measurable(dataset)
@@ -243,7 +243,7 @@ class _Settings:
 
 
 def echo_names(targets: int = 1) -> list[str]:
-    """Return the names of the echoes of a table with so many targets."""
+    """Return the echo names of a table with so many targets."""
     return [*ECHOES[:3], *(f"target_{number}" for number in range(2, targets + 1)), ECHOES[3]]
 
 
@@ -258,7 +258,7 @@ def _with_targets(part: dict[str, npt.NDArray[Any]], targets: int) -> dict[str, 
 
 
 def _measured(waveforms: Waveforms, rows: IntArray, block: int, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
-    """Return the quantities of some waveforms, of which a block is in memory at a time."""
+    """Return some waveforms' quantities, with one block in memory at a time."""
     parts = [_measure(waveforms, rows[start : start + block], settings) for start in range(0, rows.size, block)]
     count = settings.targets or max(part["flags"].shape[-1] for part in parts) - len(ECHOES) + 1
     parts = [_with_targets(part, count) for part in parts]
@@ -285,7 +285,7 @@ def _level_of_neighbours(
 
 
 def _measure(waveforms: Waveforms, rows: IntArray, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
-    """Return the quantities of some of the waveforms by name, shape (waveforms, ...)."""
+    """Return some waveforms' quantities by name, shape (waveforms, ...)."""
     records, width, level = waveforms.records(rows), waveforms.echo_fwhm_ns, waveforms.surface_level(rows)
     decision = decide(
         waveforms,

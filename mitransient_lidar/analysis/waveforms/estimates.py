@@ -1,4 +1,4 @@
-"""Surface, targets and bottom of records by one estimator of times and energies."""
+"""Surface, targets and bottom of records by one time and energy estimator."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def estimate(
     sharp
         Their deconvolved samples, shape (n, time); None unless an estimator needs them.
     threshold, iterations
-        Level of the threshold estimator in standard deviations of noise, and iterations of the deconvolution.
+        Threshold estimator's level in noise standard deviations, and deconvolution iterations.
     """
     width, template = waveforms.echo_fwhm_ns, waveforms.template
     decay = np.where(np.isfinite(column.decay), np.maximum(column.decay, 0), waveforms.fading.typical_rate)

@@ -61,7 +61,7 @@ class FirstEchoes:
     film_ns: FloatArray  #: Delay by water on land, root mean square over land and bottom [ns], shape (n,).
 
     def part(self, rows: BoolArray) -> FirstEchoes:
-        """Return those of some of the records."""
+        """Return the priors of some records."""
         bottom, surface = (
             Echoes(**{name: value[rows] for name, value in vars(one).items()}) for one in (self.bottom, self.surface)
         )
@@ -71,33 +71,18 @@ class FirstEchoes:
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known of n records before they are fitted.
+    """What is known of n records before they are fitted."""
 
-    Attributes
-    ----------
-    level
-        Time of the surface.
-    metres_per_ns, depth_per_ns
-        Height in air and depth in the water per time [m/ns], shape (n,).
-    least_column
-        Signal of the column of the clearest water at the surface [unit of the record], shape (n,); 0 where unknown.
-    decay
-        Typical rate of decay of a column [1/ns].
-    onset
-        Mean focusing of the column's light by waves.
-    opaque
-        Whether light of column and bottom is part of the surface's echo.
-    baseline_stderr
-        Standard error of weak steady signals above the level without light [unit of the record], shape (n,).
-    """
-
-    level: SurfaceLevel
+    level: SurfaceLevel  #: Time of the surface.
+    #: Height in air and depth in the water per time [m/ns], shape (n,).
     metres_per_ns: FloatArray
     depth_per_ns: FloatArray
+    #: Signal of the column of the clearest water at the surface [unit of the record], shape (n,); 0 where unknown.
     least_column: FloatArray
-    decay: float
-    onset: ColumnOnset
-    opaque: bool
+    decay: float  #: Typical rate of decay of a column [1/ns].
+    onset: ColumnOnset  #: Mean focusing of the column's light by waves.
+    opaque: bool  #: Whether light of column and bottom is part of the surface's echo.
+    #: Standard error of weak steady signals above the level without light [unit of the record], shape (n,).
     baseline_stderr: FloatArray
 
     def column(self, delay_ns: FloatArray, decay: FloatArray | float) -> tuple[FloatArray, FloatArray]:
@@ -120,14 +105,14 @@ def first_echoes(
     priors: Priors,
     extent: FloatArray,
 ) -> FirstEchoes:
-    """Decide what the first peaks of records are, with a fit of each possibility.
+    """Decide what records' first peaks are, with a fit for each possibility.
 
     Parameters
     ----------
     records, bins : Records and ndarray of int, shape (n,)
-        The waveforms and the bins of their first peaks.
+        The waveforms and their first peak bins.
     pulse, shape, width
-        The ideal echo, and the expected full width of an echo [ns].
+        The ideal echo, and the expected full echo width [ns].
     priors
         What is known before.
     extent
@@ -135,24 +120,23 @@ def first_echoes(
 
     Notes
     -----
-    All possibilities consist of the known pulse P, blurred by a Gaussian of free width for what slopes do, and of its
-    integral for a column of constant backscattering. Land is A P(t - t1). A surface is A P(t - t1) and a column from t1
-    on, which decays. A bottom at t1 + d is A P(t - t1 - d), a column from t1 to t1 + d, and the echo A' P(t - t1) of
-    its surface; heights are not negative. Fits keep the logarithm of a column's decay within about 1 of that of the
-    typical one. A bottom is followed by its light that is totally reflected at the surface and meets the bottom again:
-    of a Lambertian bottom of the reflectance rho, 2 rho d^2/u^3 per time at u > 1.5 d behind it (below a level surface,
-    later passages left out). Samples have their noise and the error of the pulse's shape; over waves of 10 %.
+    All possibilities consist of the known pulse P, blurred by a Gaussian with free width for slopes. Its integral
+    stands for a column with constant backscattering. Land is A P(t - t1). A surface is A P(t - t1) and a column from t1
+    on, which decays. A bottom at t1 + d is A P(t - t1 - d), a column from t1 to t1 + d, and its surface echo A' P(t -
+    t1); heights are not negative. Fits keep a column's log decay within about 1 of the typical one. Light that the
+    surface totally reflects meets the bottom again. For a Lambertian bottom with reflectance rho it is 2 rho d^2/u^3
+    per time at u > 1.5 d after the bottom (below a level surface, later passages left out). Samples have their noise
+    and the pulse shape's error, 10 % over waves.
 
-    The probabilities are those of Bayes' theorem with these prior distributions: land and water are as likely; heights
-    of land are uniform up to 20 m above the surface, depths of bottoms up to 10 m; the surface has the normal
-    distribution of its level; three waters in ten show no bottom; decays of columns are uniform up to ten times the
-    typical one, and logarithms of their levels from that of the clearest water to 150 times as much, or to the peak.
-    Land is thus what stands above the surface, or what has no column where even the clearest water would show one. The
-    next 160 ns behind the samples of the fits count, too: they tell a surface from land, but not from a bottom. A
-    column that a digitiser rounds to nothing does not tell them. The echoes of surface and
-    column beside a bottom cost the volume of their parameters (Laplace's approximation). Depths are means over 32
-    delays d up to that at which the surface is 4 standard deviations above its level, or from the fit of all
-    parameters where the surface has an echo of its own; errors include the spread of these delays and their spacing.
+    Probabilities follow from Bayes' theorem with these priors. Land and water are as likely. Land heights are uniform
+    up to 20 m above the surface, bottom depths up to 10 m. The surface has its level's normal distribution. Three
+    waters in ten show no bottom. Column decays are uniform up to ten times the typical one; their log levels from the
+    clearest water to 150 times as much, or to the peak. Land is thus what stands above the surface, or what has no
+    column where even the clearest water would show one. The next 160 ns behind the samples of the fits count, too: they
+    tell a surface from land, but not from a bottom. A column that a digitiser rounds to nothing does not tell them.
+    Surface and column echoes beside a bottom cost their parameter volume (Laplace's approximation). Depths are means
+    over 32 delays d, up to the surface at 4 standard deviations above its level. Where the surface has its own echo,
+    they follow from the fit of all parameters. Errors include the delays' spread and spacing.
     """
     level, count = priors.level, len(bins)
     spread = np.maximum(level.stderr_ns, _LEAST_SPREAD)
@@ -225,12 +209,11 @@ def first_echoes(
 
 @dataclass(frozen=True)
 class _Fits:
-    """Fits of the possibilities to samples; times count from the arrival of an ideal echo with its peak at the bin.
+    """Fits of the possibilities to samples; times count from an ideal echo's arrival with its peak at the bin.
 
-    Parameters are the time [ns] and the variance of the blur [ns^2] of bottom or land, its height, and the heights of
-    the surface's echo and of the column, the relative height of light that meets the bottom again, the logarithm of the
-    column's decay over the typical one, and perhaps the delay [ns]; or of a surface, its height, the height of the
-    column and this logarithm.
+    Parameters of bottom or land: time [ns], blur variance [ns^2] and height; heights of surface echo and column;
+    relative height of light that meets the bottom again; log ratio of the column's decay to the typical one; perhaps
+    the delay [ns]. A surface has its height, the column height and this logarithm.
     """
 
     data: Windows
@@ -250,7 +233,7 @@ class _Fits:
         longest: FloatArray,
         priors: Priors,
     ) -> _Fits:
-        """Return fits of samples about the peaks, with the error of the pulse's shape in their noise."""
+        """Return fits of samples about the peaks, with the pulse shape's error in their noise."""
         span = -(float(longest.max()) / width + _BEFORE), _BEHIND + _COLUMN_NS / width
         data = Windows.of(records, bins, width, 0.0, span, shape)
         peak = data.peak()
@@ -261,13 +244,13 @@ class _Fits:
         return cls(replace(data, noise=np.hypot(data.noise, error)), peak, pulse, longest, priors)
 
     def _part(self, rows: IntArray) -> _Fits:
-        """Return the fits of some of the records, with repetitions."""
+        """Return some records' fits, with repetitions."""
         data = self.data
         of_rows = {name: getattr(data, name)[rows] for name in ("power", "noise", "usable", "rate")}
         return replace(self, data=replace(data, **of_rows), peak=self.peak[rows], longest=self.longest[rows])
 
     def bottoms(self, delays: FloatArray) -> list[WindowFits]:
-        """Fit bottoms that follow a surface by delays, shape (m, n), with the peak as that of one or of the other."""
+        """Fit bottoms that follow a surface by delays, shape (m, n); the peak belongs to either."""
         found: list[WindowFits] = []
         for some in np.array_split(delays, min(math.ceil(delays.size * self.data.u.size / _AT_ONCE), len(delays))):
             delay = some.ravel()
@@ -356,7 +339,7 @@ class _Fits:
         decay: int,
         known: tuple[tuple[int, FloatArray, FloatArray], ...] = (),
     ) -> WindowFits:
-        """Fit a model with the largest values of its parameters before the decay, and what is known of some of them."""
+        """Fit a model with upper parameter limits before the decay, and what is known about some of them."""
         width, none = self.data.width, np.zeros(len(start))
         lowest, highest = np.zeros(start.shape), np.full(start.shape, np.inf)
         highest[:, :decay] = most
@@ -388,7 +371,7 @@ def _error(fit: WindowFits, index: int) -> FloatArray:
 
 
 def _occam(fit: WindowFits) -> FloatArray:
-    """Return logarithms of prior volumes over errors, of the heights of surface and column, and of the decay."""
+    """Return log ratios of prior volumes to errors, for surface and column heights and the decay."""
     covariance, total = fit.covariance, -_log_decay(fit, 6)
     known = np.maximum(covariance[:, 6, 6], 1e-300)
     for index in (3, 4):
@@ -412,14 +395,14 @@ def _log_decay(fit: WindowFits, index: int) -> FloatArray:
 
 
 def _log_normal(time: FloatArray, middle: FloatArray, spread: FloatArray) -> FloatArray:
-    """Return the logarithm of the density of times [1/ns]."""
+    """Return the times' log density [1/ns]."""
     return np.asarray(-0.5 * ((time - middle) / spread) ** 2 - np.log(spread * np.sqrt(2 * np.pi)))
 
 
 def _late_light(records: Records, first_ns: FloatArray, fits: _Fits) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return probabilities of decays, and what samples behind those of fits state of the levels of columns.
+    """Return decay probabilities, and what samples after the fitted ones state about column levels.
 
-    The logarithm of the likelihood of a level L over that of no light is L a - L^2 b/2.
+    The log likelihood ratio of a level L to no light is L a - L^2 b/2.
 
     Parameters
     ----------
@@ -452,9 +435,9 @@ def _late_light(records: Records, first_ns: FloatArray, fits: _Fits) -> tuple[Fl
 
 
 def _log_column(fit: WindowFits, records: Records, first_ns: FloatArray, fits: _Fits) -> tuple[FloatArray, FloatArray]:
-    """Return the logarithm of the mean likelihood of a column over its prior levels, relative to the fitted one.
+    """Return a column's log mean likelihood over its prior levels, relative to the fitted one.
 
-    First without light behind the samples of the fits, and then with it, over that of no such light.
+    First without light after the fitted samples, then with it, relative to no such light.
     """
     priors, peak = fits.priors, fits.peak
     error, found = np.where(_error(fit, 3) > 0, _error(fit, 3), peak), fit.values[:, 3]

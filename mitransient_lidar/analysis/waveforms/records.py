@@ -43,72 +43,47 @@ _LONGEST_ECHO = 4.0  # largest expected width of an echo, in pulse widths
 
 @dataclass(frozen=True)
 class Waveforms:
-    """Waveforms of a dataset with the quantities that their measurement needs.
+    """Waveforms of a dataset with the quantities that their measurement needs."""
 
-    Attributes
-    ----------
-    dims, shape, unit
-        Dimensions, their sizes and the unit of the variable.
-    samples
-        Its values, shape (count, time), with all pixels of a shot before the next shot; of a signal after a logarithm,
-        the voltages before it.
-    time_ns
-        Centres of the bins [ns], shape (time,).
-    baseline, noise
-        Level of each pixel without light, shape (pixels,), and standard deviation of its samples, shape (pixels, time)
-        or (pixels, 1), or of each waveform where it differs between shots, shape (count, time).
-    baseline_stderr
-        Standard error of weak steady signals above this level, by the level and by rounding, shape (pixels,).
-    saturated, saturation_level
-        Samples at a limit, of the shape of `samples`, and the least such sample.
-    kernel, template, echo_shape
-        Pulse and response in bins, and the shape of an ideal echo, also as a sum of Gaussians.
-    focusing, onset
-        Mean focusing of the column's light by waves, None where it is not known, and the onset of the column.
-    fading
-        How the column fades by absorption.
-    echo_fwhm_ns, quiet_until_ns
-        Expected width of an echo, and end of the part of the record without echoes [ns].
-    geometry
-        Lidar geometry on the axis.
-    lines
-        Lines of sight, of the pixels of every shot or of one for all shots, shape (pixels,).
-    event_height
-        Height that single events of the detector reach, shape (pixels,).
-    lowest_m, highest_m
-        Lowest point of the sea [m], negative, and its highest one; those of a rough sea where they are not known.
-    sensitivity, column_gain
-        Signal per power of steady light [unit/W], shape (pixels,), and power of a column at the surface per
-        backscattering coefficient [W m], 0 and NaN where they are not known.
-    shared
-        Correlation of the noise of samples as of `echo_detection.Records`, None where samples are independent.
-    """
-
+    #: Dimensions, their sizes and the unit of the variable.
     dims: tuple[str, ...]
     shape: tuple[int, ...]
     unit: str
+    #: Its values, shape (count, time), with all pixels of a shot before the next shot; of a signal after a logarithm,
+    #: the voltages before it.
     samples: npt.NDArray[Any]
-    time_ns: FloatArray
+    time_ns: FloatArray  #: Centres of the bins [ns], shape (time,).
+    #: Level of each pixel without light, shape (pixels,), and standard deviation of its samples, shape (pixels, time)
+    #: or (pixels, 1), or of each waveform where it differs between shots, shape (count, time).
     baseline: FloatArray
     noise: FloatArray
+    #: Standard error of weak steady signals above this level, by the level and by rounding, shape (pixels,).
     baseline_stderr: FloatArray
+    #: Samples at a limit, of the shape of `samples`, and the least such sample.
     saturated: npt.NDArray[np.bool_] | None
     saturation_level: float
+    #: Pulse and response in bins, and the shape of an ideal echo, also as a sum of Gaussians.
     kernel: tuple[int, FloatArray]
     template: Template
     echo_shape: EchoShape
+    #: Mean focusing of the column's light by waves, None where it is not known, and the onset of the column.
     focusing: Focusing | None
     onset: ColumnOnset
-    fading: Fading
+    fading: Fading  #: How the column fades by absorption.
+    #: Expected width of an echo, and end of the part of the record without echoes [ns].
     echo_fwhm_ns: float
     quiet_until_ns: float
-    geometry: LidarGeometry
-    lines: LinesOfSight
-    event_height: FloatArray
+    geometry: LidarGeometry  #: Lidar geometry on the axis.
+    lines: LinesOfSight  #: Lines of sight, of the pixels of every shot or of one for all shots, shape (pixels,).
+    event_height: FloatArray  #: Height that single events of the detector reach, shape (pixels,).
+    #: Lowest point of the sea [m], negative, and its highest one; those of a rough sea where they are not known.
     lowest_m: float
     highest_m: float
+    #: Signal per power of steady light [unit/W], shape (pixels,), and power of a column at the surface per
+    #: backscattering coefficient [W m], 0 and NaN where they are not known.
     sensitivity: FloatArray
     column_gain: float
+    #: Correlation of the noise of samples as of `echo_detection.Records`, None where samples are independent.
     shared: BlockCorrelation | None = None
 
     @property
@@ -245,11 +220,11 @@ class Waveforms:
         return np.arange(self.count)[rows]
 
     def lines_of(self, rows: Rows) -> LinesOfSight:
-        """Return the lines of sight of some of the waveforms."""
+        """Return some waveforms' lines of sight."""
         return self.lines.at(self._numbers(rows) % self.lines.off_nadir.size)
 
     def latest_surface(self, rows: Rows) -> FloatArray:
-        """Return the latest times of the surface echo [ns], of the lowest point of the sea, shape (waveforms,).
+        """Return the latest surface echo times [ns], for the sea's lowest point, shape (waveforms,).
 
         Pixels without direct light have none.
         """
@@ -260,7 +235,7 @@ class Waveforms:
         return np.asarray(lines.surface_time + np.where(dark, 0, trough + margin))
 
     def surface_level(self, rows: Rows) -> SurfaceLevel:
-        """Return the arrival of the mean sea level in some of the waveforms, with the waves about it."""
+        """Return the mean sea level's arrival in some waveforms, with the waves about it."""
         lines = self.lines_of(rows)
         per_metre = 1 / (0.5e-9 * C0 * np.cos(lines.off_nadir))
         waves = (self.highest_m - self.lowest_m) / HEIGHTS
@@ -289,7 +264,7 @@ class Waveforms:
         return spreading * self.focusing.at(lines.depth_of_time(np.broadcast_to(self.time_ns, spreading.shape)))
 
     def saturated_samples(self, rows: Rows, records: Records) -> npt.NDArray[np.bool_]:
-        """Return which samples of some of the waveforms are saturated, shape (waveforms, time)."""
+        """Return which samples are saturated in some waveforms, shape (waveforms, time)."""
         baseline = self.baseline[self._numbers(rows) % self.baseline.size, np.newaxis]
         high: npt.NDArray[np.bool_] = records.power + baseline >= self.saturation_level
         return high if self.saturated is None else high | self.saturated[rows]
@@ -355,7 +330,7 @@ def _receiver_response(dataset: xr.Dataset, step: float) -> Response | None:
 
 
 def _lines_of_sight(dataset: xr.Dataset, dims: tuple[str, ...]) -> LinesOfSight:
-    """Return the lines of sight of the waveforms, once for all shots if they share them."""
+    """Return the waveforms' lines of sight, once for all shots if they share them."""
     moves = any("shot" in dataset[name].dims for name in ("surface_time", "angle_x") if name in dataset.coords)
     return LinesOfSight.from_dataset(dataset, dims if moves else tuple(dim for dim in dims if dim != "shot"))
 
@@ -385,7 +360,7 @@ def _expanded(dataset: xr.Dataset, logarithm: LogAmplifier) -> xr.Dataset:
 
 
 def _echo_width(dataset: xr.Dataset, template: Template, ns_per_mrad: float) -> float:
-    """Return the width [ns] of an echo of the level sea over the footprint of the beam or of the field of view."""
+    """Return a level sea's echo width [ns] over the footprint of beam or field of view."""
     sigma = 0.5 * float(dataset.attrs.get("divergence_mrad", 0.0))
     if field := float(dataset.attrs.get("field_of_view_mrad", 0.0)):
         sigma = min(sigma, 0.25 * field)
@@ -403,7 +378,7 @@ def _noise(
     noise: float | npt.ArrayLike | None,
     run: int,
 ) -> FloatArray:
-    """Return the noise for means of `run` samples, of the shapes of `Waveforms.noise`."""
+    """Return the noise for means of `run` samples, shaped as `Waveforms.noise`."""
     pixels, count = baseline.size, samples.shape[1]
     if noise is not None:
         given = np.asarray(noise, dtype=np.float64)
@@ -426,7 +401,7 @@ def _noise(
 def _noise_of_render(
     dataset: xr.Dataset, deviation: FloatArray, run: int
 ) -> tuple[FloatArray, BlockCorrelation | None]:
-    """Return the noise for means of `run` samples of a render with the errors `deviation`, and its correlation."""
+    """Return the noise for means of `run` render samples with the errors `deviation`, and its correlation."""
     errors = SumErrors.of(dataset)
     if errors is None:
         return deviation, None
@@ -442,7 +417,7 @@ def _receiver_noise(
     quiet: npt.NDArray[np.bool_],
     run: int,
 ) -> FloatArray:
-    """Return the noise of the receiver's signal for means of `run` samples."""
+    """Return the receiver signal's noise for means of `run` samples."""
     pixels, count = baseline.size, samples.shape[1]
     if "block_level" in dataset:  # noise alone is hardly stored
         stated, mean = (dataset[key].values.reshape(-1, count) for key in ("signal_deviation", "signal_mean"))

@@ -1,4 +1,4 @@
-"""Limits of samples: how long echoes are clipped, which of these meet a bottom twice, and steps and noise."""
+"""Sample limits: how long echoes are clipped, which meet a bottom twice, digitiser steps, and noise of means."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def saturated_spans(saturated: BoolArray, bins: IntArray, width: float) -> Float
     saturated
         Whether samples are saturated, shape (n, time).
     bins
-        Bins of the peaks, -1 without an echo, shape (echo, n).
+        Peak bins, -1 without an echo, shape (echo, n).
     width
         Echo width in bins, by which runs of saturated samples may be apart to count as one.
     """
@@ -53,7 +53,7 @@ def widen(errors: FloatArray, spans: FloatArray) -> None:
 
 
 def longest_run(saturated: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return the first and last bin of the longest run of saturated samples, shape (n, time); 1 and 0 without any."""
+    """Return first and last bin of the longest saturated run, samples of shape (n, time); 1 and 0 without any."""
     index = np.arange(saturated.shape[1])
     run = index - np.maximum.accumulate(np.where(saturated, -1, index), axis=1)
     last = run.argmax(axis=1)
@@ -65,8 +65,8 @@ def may_be_second_return(
 ) -> BoolArray:
     """Return which echoes may be light that a bottom within a clipped time has returned twice.
 
-    Times of echoes, and halves of their delays behind the mean surface, are of the shape (n, estimator, echo), first
-    and last clipped times (n, 2). Half delays below two echo widths are within the surface's own echo.
+    Echo times, and half their delays after the mean surface, have the shape (n, estimator, echo), first and last
+    clipped times (n, 2). Half delays below two echo widths are within the surface's own echo.
     """
     start, end = clipped_ns.T[..., np.newaxis, np.newaxis]
     clipped = (start <= time_ns - half_ns) & (time_ns - half_ns <= end) & (half_ns > 2 * width_ns)
@@ -81,15 +81,15 @@ def level_error(rest: FloatArray, inflated: float, samples: npt.NDArray[np.float
     rest
         Samples without light less this level, shape (shots, pixels, bins).
     inflated
-        Standard deviation of means of neighbouring samples over that of independent ones.
+        Standard deviation ratio for means of samples, neighbouring to independent.
     samples
         Samples with light, whose least difference is the step of the digitiser.
 
     Notes
     -----
-    Noise of a standard deviation s spreads a level over steps h of a digitiser: the mean deviates by rounding by
-    h/pi exp(-2 pi^2 s^2/h^2) at most (B. Widrow, I. Kollar, M.-C. Liu, IEEE Trans. Instrum. Meas. 45, 353 (1996)).
-    Without noise, each of signal and level is uniformly distributed over a step.
+    Noise with standard deviation s spreads a level over digitiser steps h: rounding shifts the mean by h/pi exp(-2 pi^2
+    s^2/h^2) at most (B. Widrow, I. Kollar, M.-C. Liu, IEEE Trans. Instrum. Meas. 45, 353 (1996)). Without noise, each
+    of signal and level is uniformly distributed over a step.
     """
     steps = np.diff(np.unique(samples))
     step = float(steps.min()) if steps.size else 0.0

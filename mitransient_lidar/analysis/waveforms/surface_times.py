@@ -1,4 +1,4 @@
-"""Arrival of the surface in every pixel of a shot: its own echo, or that of the pixels with direct light."""
+"""Surface arrival in every pixel of a shot: its own echo, or pixels with direct light."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ class SurfaceLevel(NamedTuple):
     ) -> SurfaceLevel:
         """Return arrivals by the mean level of the surfaces that are known, if they are several; else these.
 
-        The arguments have the shape (n,): measured arrivals of surfaces, their errors [ns], which of them count, and
-        time per height [ns/m]. The level is the median height, and its error the robust spread of heights, waves
-        included, and that of the onset of columns.
+        The arguments have the shape (n,): measured surface arrivals, their errors [ns], which ones count, and time per
+        height [ns/m]. The level is the median height; its error contains the robust height spread, waves included, and
+        the column onset error.
         """
         known = known & (2 * error_ns < self.stderr_ns)
         count = np.count_nonzero(known)
@@ -96,21 +96,20 @@ def infrared_level(
     Parameters
     ----------
     table
-        Echoes of the infrared channel, of one estimator.
+        Infrared channel echoes by one estimator.
     infrared, green
-        Results or records of both.
+        Both results or records.
     lines
-        Lines of sight of the green pixels of a shot, shape (pixels,), or of all waveforms.
+        Lines of sight for a shot's green pixels, shape (pixels,), or all waveforms.
     count
         Number of green waveforms.
 
     Notes
     -----
-    The height of the surface in the infrared pixel with most of the beam, over the mean sea level, is that in the green
-    pixels. Its error is that of the infrared time and of the triggers and clocks of both records. The waves add the
-    standard deviation of slopes averaged over the green beam times the distance of the pixel from the infrared beam,
-    and times a quarter of the green beam's diameter for its own mean height. Where it is not
-    known, the level is NaN.
+    Green pixels share the surface height over mean sea level in the infrared pixel that has most of the beam. Its error
+    stems from the infrared time and both records' triggers and clocks. Waves add the standard deviation of slopes
+    averaged over the green beam, times two lengths: the pixel's distance from the infrared beam, and a quarter of the
+    green beam's diameter for its own mean height. Where it is not known, the level is NaN.
     """
     dims = tuple(str(dim) for dim in table["surface_time_ns"].dims)
     own = LinesOfSight.from_dataset(infrared, dims)
@@ -142,7 +141,7 @@ def infrared_level(
 
 
 def check_surface(corrections: xr.Dataset, infrared: bool) -> None:
-    """Raise `UserError` for a table of depth errors from surfaces of another channel than depths count from."""
+    """Raise `UserError` for a depth error table whose surfaces are another channel's than depths count from."""
     if bool(corrections.attrs.get("infrared_surface", 0)) != infrared:
         kinds = ("green light, but depths", "infrared") if infrared else ("infrared light, but depths", "green")
         advice = ": take one of depth-bias --infrared" if infrared else ""
@@ -178,34 +177,34 @@ def surface_times(
     lines : LinesOfSight
         Lines of sight with arrays of shape (shots, pixels).
     slope_variance : float
-        Variance of the sea's slopes, the sum over two directions [1].
+        Variance of sea slopes, summed over two directions [1].
     heights_m : (float, float)
-        Lowest and highest point of the sea [m], infinite if unknown.
+        Lowest and highest sea point [m], infinite if unknown.
     echo_fwhm_ns : float
-        Expected full width of an echo at half maximum [ns].
+        Expected full echo width at half maximum [ns].
     trigger_ns, clock_ns : float
-        Standard deviations of the time of a shot, which its pixels share, and of a pixel [ns]; see `ShotJitter`.
+        Standard deviations of a shot's time, which its pixels share, and a pixel's [ns]; see `ShotJitter`.
 
     Returns
     -------
     SurfaceTimes
-        From the own times of pixels that have at least a thousandth of the light of the brightest pixel, and whose
-        deviation from the level sea agrees, within 4 standard deviations, with the heights of the sea and with the
-        median of the pixels, weighted with their light. The times of other pixels follow these; without any, they are
-        those of the mean sea level with the standard deviation of the heights as error, or NaN where the heights are
-        unknown. Where the shares of the beam are unknown, all times are own.
+        From pixels' own times where they have at least a thousandth of the brightest pixel's light. Their deviation
+        from the level sea must agree, within 4 standard deviations, with the sea heights and with the light-weighted
+        median over pixels. The times of other pixels follow these. Without any, the mean sea level counts with the
+        heights' standard deviation as error, or NaN where heights are unknown. Where the shares of the beam are
+        unknown, all times are own.
 
     Notes
     -----
-    The deviation from the level sea is the same in all pixels of a shot, with the variance of the sea's heights, plus
-    that of each pixel, whose standard deviation is the slope of the sea times the distance of the pixel from the middle
-    of the light; its echo has the errors by noise and method. The times are the means of the deviations given all
-    echoes of the shot, which draws uncertain times to the mean sea level and to those of the other pixels. An echo
-    agrees with these within its error, that of its shape, a tenth of its width, and the spread of the light.
+    The deviation from the level sea has two parts. One is shared by all pixels of a shot, with the sea heights'
+    variance. Each pixel's own has the sea slope times its distance from the light's middle as standard deviation. Its
+    echo has the errors by noise and method. Times are mean deviations given all echoes of the shot. This draws
+    uncertain times to the mean sea level and to the other pixels. An echo agrees with these within its error, its shape
+    error, a tenth of its width, and the light spread.
 
-    The error by noise includes what trigger and clock change between this time and later echoes of the same pixel:
-    nothing if the time is that of its own echo, the clocks of all pixels that it is taken from, and both as far as it
-    is drawn to the mean sea level.
+    The error by noise includes what trigger and clock change between this time and later echoes of the same pixel. This
+    is nothing for the pixel's own echo. Otherwise it is the clocks of all source pixels, and both as far as the time is
+    drawn to the mean sea level.
     """
     known = np.isfinite(time_ns)
     share = lines.beam_share
@@ -257,7 +256,7 @@ def surface_times(
 
 
 def _tilt_ns(lines: LinesOfSight, slope: float) -> FloatArray:
-    """Return the deviation [ns] of arrivals by a slope of the sea about the middle of the beam's light."""
+    """Return arrival deviations [ns] by a sea slope about the middle of the beam's light."""
     half = 0.5e-9 * C0  # metres of range per nanosecond
     away = lines.surface_time * half
     cosine = np.cos(lines.off_nadir)

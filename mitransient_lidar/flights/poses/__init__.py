@@ -1,1 +1,1 @@
-"""Poses of pulses: trajectories of platforms, scanners and their mounting."""
+"""Pulse poses: platform trajectories, scanners and their mounting."""

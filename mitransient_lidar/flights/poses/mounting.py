@@ -1,4 +1,4 @@
-"""Mounting of a scanner on a platform, and the lines of sight of all pulses."""
+"""Mounting a scanner on a platform, and the lines of sight of all pulses."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ _TURN_DEG, _LEVEL = 10.0, 1e-6
 class Mounting(Plan):
     """Position and attitude of a scanner on its platform.
 
-    Angles are those from the axes of the platform, with the signs and the order ``aerospace`` of
-    `records.rotation_matrices`.
+    Angles are from the platform axes, with signs and order ``aerospace`` of `records.rotation_matrices`.
     """
 
     roll_deg: Annotated[float, Option("Roll, which turns the nadir of the scanner to the left", unit="deg")] = 0.0
@@ -43,13 +42,13 @@ class Mounting(Plan):
 
     @property
     def rotation(self) -> FloatArray:
-        """Matrix from the axes of the scanner to those of the platform, shape (3, 3)."""
+        """Matrix from scanner to platform axes, shape (3, 3)."""
         return rotation_matrices(self.roll_deg, self.pitch_deg, self.yaw_deg)
 
 
 @dataclass(frozen=True)
 class PulsePoses(Pose):
-    """Poses of the scanner at pulses in the frame of the scene, x east, y north and z up."""
+    """Scanner poses at pulses in the scene frame, x east, y north and z up."""
 
     time_s: FloatArray  #: Times [s], shape (shots,).
     #: Angles of the pulses across the flight from the vertical [deg], positive to the right of the platform's forward
@@ -59,13 +58,13 @@ class PulsePoses(Pose):
 
 
 def pulse_poses(trajectory: Trajectory, mounting: Mounting, scanner: Scanner, times: npt.ArrayLike) -> PulsePoses:
-    """Return the lines of sight of pulses.
+    """Return lines of sight of pulses.
 
-    With the rotations R of the platform and M of the mounting, a direction d of the scanner is R M d in the scene, and
-    the scanner is at the position of the trajectory plus R times the lever arm.
+    With platform rotation R and mounting rotation M, a scanner direction d is R M d in the scene. The scanner is at the
+    trajectory's position plus R times the lever arm.
 
-    `trajectory`, `mounting`, `scanner`: motion of the platform, place of the scanner on it, and scan. `times`: times of
-    the pulses [s], on the flight lines, shape (shots,).
+    `trajectory`, `mounting`, `scanner`: platform motion, scanner place on it, and scan. `times`: times of the pulses
+    [s], on the flight lines, shape (shots,).
 
     Raises
     ------
@@ -101,8 +100,7 @@ def poses_of(column: Callable[[str], FloatArray]) -> Pose:
 def pixel_turns(poses: Pose) -> FloatArray:
     """Return the angles [deg] by which pixels are turned about their axis, from far to left, shape (shots,).
 
-    They are those to the plane of incidence, rounded to multiples of 10 degrees, -170 to 180; 0 of an axis that is
-    vertical.
+    They point to the plane of incidence, rounded to multiples of 10 degrees, -170 to 180; 0 for vertical axes.
     """
     axis, far = poses.axis, poses.far
     # Left of the plane of incidence is level.

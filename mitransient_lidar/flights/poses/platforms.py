@@ -1,4 +1,4 @@
-"""Platforms of a flight: straight and parallel lines and masts, with random attitudes, and trajectories of files."""
+"""Flight platforms: straight and parallel lines and masts, with random attitudes, and trajectories from files."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ class TrajectoryFile(Platform):
 
     @abstractmethod
     def _records(self, path: Path) -> tuple[PlatformPoses, RotationSpec]:
-        """Return the records of a file, and the order of their rotations."""
+        """Return a file's records, and their rotation order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,5 +226,5 @@ PLATFORM_KINDS: dict[str, type[Platform]] = {"lines": Lines, "mast": Mast, "csv"
 
 
 def platform_of(given: object) -> Platform:
-    """Return the platform of the table ``[platform]`` of a plan; raise `UserError` as `Plan.of`."""
+    """Return the platform of a plan's ``[platform]`` table; raise `UserError` as `Plan.of`."""
     return of_kind("platform", given, PLATFORM_KINDS)

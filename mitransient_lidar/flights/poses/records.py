@@ -1,4 +1,4 @@
-"""Records of a trajectory: attitudes, times of a flight, a GPS week or GPS time, and the checks of both."""
+"""Trajectory records: attitudes, times (flight, GPS week or GPS time), and checks of both."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ RotationSpec = Literal["aerospace", "ARINC 705", "CANONICAL"]
 def rotation_matrices(
     roll_deg: npt.ArrayLike, pitch_deg: npt.ArrayLike, yaw_deg: npt.ArrayLike, rotation_spec: RotationSpec = "aerospace"
 ) -> FloatArray:
-    """Return the matrices that turn vectors of the body into vectors of the scene.
+    """Return the matrices that turn body vectors into scene vectors.
 
-    ``aerospace`` is yaw . pitch . roll: the vector is first turned by roll about the forward axis (positive: right side
-    down), then by pitch about the axis to the right (positive: nose up), then by yaw about the downward vertical
-    (positive: clockwise from above, so that yaw is the heading from north). ``ARINC 705``, the default of HELIOS++, has
-    the same signs but yaw . roll . pitch: pitch acts first. ``CANONICAL`` of HELIOS++ is roll about x, pitch about y
-    and yaw about z, all counterclockwise seen against the axis, with yaw acting first.
+    ``aerospace`` is yaw . pitch . roll: roll first turns the vector about the forward axis (positive: right side down).
+    Pitch then turns it about the axis to the right (positive: nose up), yaw about the downward vertical (positive:
+    clockwise from above, so that yaw is the heading from north). ``ARINC 705``, the default of HELIOS++, has the same
+    signs but yaw . roll . pitch: pitch acts first. ``CANONICAL`` of HELIOS++ is roll about x, pitch about y and yaw
+    about z, all counterclockwise seen against the axis, with yaw acting first.
 
     `roll_deg`, `pitch_deg`, `yaw_deg`: angles [deg], shape (n,). `rotation_spec`: order of the rotations.
 
@@ -84,10 +84,11 @@ _EPOCH = datetime.datetime(1980, 1, 6)
 
 
 def time_system(time_s: FloatArray, file: str | None = None, *, is_sbet: bool = False) -> TimeSystem:
-    """Return the system of the times of a platform, where its table does not state it.
+    """Return a platform's time system, where its table does not state it.
 
-    Times of a file from 10^7 s on are adjusted GPS times, and from 10^9 s on GPS times. Smaller ones are of a week in
-    an SBET file, up to a day after its end, and of the flight in a text file. Other platforms begin with their flight.
+    Times of a file from 10^7 s on are adjusted GPS times, and from 10^9 s on GPS times. In an SBET file, smaller ones
+    count from a week's start, up to a day after its end; in a text file, from the flight's. Other platforms begin with
+    their flight.
 
     Raises UserError if the times may be Unix times.
 
@@ -129,20 +130,11 @@ _LARGEST = 1e12
 
 @dataclass(frozen=True, eq=False)
 class PlatformPoses:
-    """Positions and attitudes of a platform, one for each time.
+    """Positions and attitudes of a platform, one for each time."""
 
-    Parameters
-    ----------
-    time_s
-        Times [s], shape (n,).
-    position
-        Positions x (east), y (north), z (up) [m], shape (n, 3).
-    roll_deg, pitch_deg, yaw_deg
-        Attitudes [deg], shape (n,): right side down, nose up, and clockwise from north.
-    """
-
-    time_s: FloatArray
-    position: FloatArray
+    time_s: FloatArray  #: Times [s], shape (n,).
+    position: FloatArray  #: Positions x (east), y (north), z (up) [m], shape (n, 3).
+    #: Attitudes [deg], shape (n,): right side down, nose up, and clockwise from north.
     roll_deg: FloatArray
     pitch_deg: FloatArray
     yaw_deg: FloatArray

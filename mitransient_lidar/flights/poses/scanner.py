@@ -1,4 +1,4 @@
-"""Scanners: directions of pulses, and of the pixels about them, in the frame of the scanner."""
+"""Scanners: directions of pulses and of the pixels about them, in the scanner frame."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Phase = Annotated[float, Option("Phase of the cycle at time 0", unit="deg")]
 
 
 class ScanDirections(NamedTuple):
-    """Lines of sight in the frame of the scanner, x to its right, y forward and z up; each of shape (n, 3)."""
+    """Lines of sight in the scanner frame, x to its right, y forward and z up; shape (n, 3) each."""
 
     axis: FloatArray  #: Unit directions of the pulses.
     far: FloatArray  #: Directions of +angle_x of the pixels.
@@ -43,16 +43,16 @@ class Scanner(Plan, ABC):
     The frame of the scanner has x to its right, y forward and z up; its nadir is -z. Azimuths are counted from forward,
     clockwise from above. Cycles begin at time 0 of the trajectory.
 
-    Pixels that turn with the ``scan`` have far (+angle_x) away from the nadir of the scanner; at the nadir itself it
-    has the limit along the scan, or points to the right. Those of the ``platform`` have far forward at the nadir, and
-    it goes with the beam by the shortest rotation from there.
+    Pixels that turn with the ``scan`` have far (+angle_x) away from the scanner nadir. At the nadir itself it has the
+    limit along the scan, or points to the right. Those of the ``platform`` have far forward at the nadir, and it goes
+    with the beam by the shortest rotation from there.
     """
 
     pixels: Annotated[Literal["scan", "platform"], Option("What the pixels turn with")] = "scan"
 
     @staticmethod
     def of_table(given: object) -> Scanner:
-        """Return the scanner of the table ``[scanner]`` of a plan: ``kind`` (`SCANNER_KINDS`) and its parameters.
+        """Return the scanner of a plan's ``[scanner]`` table: ``kind`` (`SCANNER_KINDS`) and its parameters.
 
         Raises
         ------
@@ -123,7 +123,7 @@ class SemiArc(Scanner):
 
 @dataclass(frozen=True, kw_only=True)
 class Oscillating(Scanner):
-    """Lines across the flight, as of an oscillating mirror; a ``sawtooth`` is that of a rotating polygon.
+    """Lines across the flight, as by an oscillating mirror; a ``sawtooth`` as by a rotating polygon.
 
     At phase 0 the beam is at the nadir and moves to the right; a ``sawtooth`` begins at the left end.
     """
@@ -144,12 +144,12 @@ class Oscillating(Scanner):
 
 @dataclass(frozen=True, kw_only=True)
 class Raster(Scanner):
-    """Parallel lines of points, as of a mast or a gimbal with two axes.
+    """Parallel lines of points, as from a mast or two-axis gimbal.
 
-    The outer axis points to the right, and turns the beam from the nadir forward by the angle along; the inner one
-    turns it to the right by the angle across. All points of a line follow each other, then those of the next line, at
-    equal times: a pulse rate of rate_hz * lines * points gives one pulse to each point, also at GPS times, which are
-    rounded. A flight line begins with a whole point. One line, or one point of each, is in the middle.
+    The outer axis points to the right, and turns the beam from nadir forward by the angle along. The inner axis turns
+    it to the right by the angle across. All points of a line follow each other at equal times, then the next line. A
+    pulse rate of rate_hz * lines * points gives one pulse to each point, also at rounded GPS times. A flight line
+    begins with a whole point. One line, or one point of each, is in the middle.
     """
 
     along_deg: Annotated[

@@ -1,4 +1,4 @@
-"""Trajectories: position and attitude of a platform over time, from text files or SBET files of inertial navigation."""
+"""Trajectories: platform position and attitude over time, from text files or SBET files (inertial navigation)."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ def read_text_records(path: str | os.PathLike[str]) -> PlatformPoses:
     ``#HEADER: "t", "x", ...`` or in a first line without numbers; ``#TIME_COLUMN: 0`` names the column of the time by
     its index from 0. Unlike HELIOS++, which sorts records, this function refuses times that go back.
 
-    Raises UserError if the file cannot be read, a column or its unit is unknown, a column is missing, or a line does
-    not hold one finite number for each column at a time later than the time of the line before.
+    Raises UserError if the file cannot be read, a column or its unit is unknown, or a column is missing. Each line
+    needs one finite number for each column, and a later time than the line before.
     """
     path = Path(path)
     head = {}
@@ -92,18 +92,18 @@ def read_text_records(path: str | os.PathLike[str]) -> PlatformPoses:
 def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> PlatformPoses:
     """Read a trajectory from an SBET file, and project it into a coordinate system.
 
-    A record is 17 little-endian 64-bit numbers: time [s]; latitude and longitude [rad] and ellipsoidal height [m] of
-    WGS 84; three velocities; roll, pitch and platform heading [rad]; wander angle [rad]; three accelerations; three
-    angular rates. The true heading is the platform heading less the wander angle; yaw is counted from grid north, from
-    which true north differs by the meridian convergence.
+    A record is 17 little-endian 64-bit numbers: time [s]; WGS 84 latitude and longitude [rad] and ellipsoidal height
+    [m]; three velocities; roll, pitch and platform heading [rad]. Then follow wander angle [rad], three accelerations
+    and three angular rates. The true heading is the platform heading less the wander angle; yaw is counted from grid
+    north, from which true north differs by the meridian convergence.
 
-    Raises UserError if the file cannot be read or has more than 1 GiB; its size is no multiple of 136 bytes; a record
-    is not finite, not on the Earth, or not later than the one before; or the coordinate system is unknown, has no
-    metres, or has another scale there.
+    Raises UserError if the file cannot be read, has more than 1 GiB, or its size is no multiple of 136 bytes. A record
+    must be finite, on the Earth, and later than the one before. The coordinate system must be known, in metres, and
+    have this scale there.
 
     `path`: SBET file. `epsg`: EPSG code of projected coordinates in metres, such as 32633 for UTM zone 33 N. x is east
-    and y north on the grid; z is the ellipsoidal height [m]. Positions have the scale of the grid, within a zone of UTM
-    0.9996 to 1.001, which may differ from 1 by 1 %.
+    and y north on the grid; z is the ellipsoidal height [m]. Positions have the grid scale, within a UTM zone 0.9996 to
+    1.001; it may differ from 1 by 1 %.
     """
     import pyproj
 
@@ -168,8 +168,8 @@ _LAST_PULSE = 1e-6
 class InterpolatedPoses(PlatformPoses):
     """Poses of a platform at any times, roll and pitch -180 to 180 and yaw 0 to 360 degrees.
 
-    `rotation`: matrices from the axes of the platform to those of the scene, shape (n, 3, 3). `line`: number of the
-    flight line, from 0, shape (n,).
+    `rotation`: matrices from platform to scene axes, shape (n, 3, 3). `line`: number of the flight line, from 0, shape
+    (n,).
     """
 
     rotation: FloatArray

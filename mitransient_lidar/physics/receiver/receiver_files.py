@@ -105,23 +105,12 @@ class ReceiverChannels:
 
     Raises UserError if the channels differ in the amplifier response, the logarithm, the converter or the jitter, which
     the record has in common.
-
-    Attributes
-    ----------
-    default
-        Channel for pixels that `channels` does not name.
-    channels
-        Channels by pixel name.
-    pulse_repetition_khz
-        Pulse repetition rate [kHz], or None.
-    name
-        Name of the preset, instrument, or file.
     """
 
-    default: Channel
-    channels: Mapping[str, Channel] = field(default_factory=dict)
-    pulse_repetition_khz: float | None = None
-    name: str = "custom"
+    default: Channel  #: Channel for pixels that `channels` does not name.
+    channels: Mapping[str, Channel] = field(default_factory=dict)  #: Channels by pixel name.
+    pulse_repetition_khz: float | None = None  #: Pulse repetition rate [kHz], or None.
+    name: str = "custom"  #: Name of the preset, instrument, or file.
 
     def __post_init__(self) -> None:
         for name, channel in self.channels.items():
