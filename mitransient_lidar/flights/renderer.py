@@ -128,6 +128,10 @@ class FlightRenderer(Renderer):
             pilots, seconds = renderer._pilots(columns, progress)
             settings = chosen_settings(pilots, plan)
             saturated = saturated_pulses(pilots, plan, settings)
+            if other is not None:
+                own_start, bins = (columns[name] for name in _OF_INFRARED)
+                found, _ = _infrared(renderer, int(bins[0]))._pilots({**columns, "record_start_ns": own_start}, None)
+                settings = settings | {f"infrared_{name}": one for name, one in chosen_settings(found, other).items()}
         columns |= {name: np.full(start.shape, value) for name, value in settings.items()}
         tell_forecast(saturated, pilots.sizes["shot"], bool(settings), start.size, seconds)
         return renderer, columns
@@ -135,11 +139,12 @@ class FlightRenderer(Renderer):
     def describe_input(self, name: str, column: Column) -> dict[str, Any]:
         """Return a pulse input's attributes."""
         for setting, text in SETTINGS.items():
-            if name.startswith(setting):
-                number = name.removeprefix(setting)
+            whose, found, number = name.partition(setting)
+            if found:
                 return {
                     "units": "1",
-                    "long_name": f"{text} of channel {number} of the receiver, chosen for the flight",
+                    "long_name": f"{text} of channel {number} of the {whose.replace('_', ' ')}receiver, "
+                    "chosen for the flight",
                     "saturating_share": SATURATING,
                 }
         return described(name, "flight")
@@ -214,6 +219,7 @@ class FlightRenderer(Renderer):
         """
         start, bins = (inputs[name] for name in _OF_INFRARED)
         own = {name: column for name, column in inputs.items() if not name.startswith(tuple(SETTINGS))}
+        own = {name.removeprefix("infrared_"): column for name, column in own.items()}
         renderer = _infrared(self, int(bins[0]))
         series, own_later, _ = renderer._render({**own, "record_start_ns": start}, self._passes(until_error=True))
         series["waveform_stderr"] = pooled_errors(

@@ -297,7 +297,7 @@ def traced(scene: WaterScene, pose: KernelPose, angles: FloatArray) -> FloatArra
     rays = pose.directions(angles)
     if pose.submerged:
         start = np.broadcast_to(pose.origin, rays.shape)
-        ends = first_along(scene, [*scene.solids, *scene.surfaces], [start, start + _REACH * rays])
+        ends = first_along(scene, [start, start + _REACH * rays], [*scene.solids, *scene.surfaces])
         ends = np.where(np.isfinite(ends), ends, start + _REACH * rays)
         return np.asarray(np.stack([start, start, ends]) + scene.frame_origin)
     falls = rays[:, 2] < -_SMALLEST_DESCENT
@@ -312,12 +312,12 @@ def traced(scene: WaterScene, pose: KernelPose, angles: FloatArray) -> FloatArra
         return np.insert(water.at_height(pose.origin, rays, z), 2, z, axis=1)
 
     corners = [start, *(at(sea, z) for z in levels)]
-    ends = first_along(scene, scene.solids, corners)
+    ends = first_along(scene, corners)
     # Rays in single precision may pass between two triangles where they meet an edge: those beside them do not.
     if (missed := np.isnan(ends[:, 0])).any():
-        ends[missed] = first_along(scene, scene.solids, [corner[missed] + _ASIDE for corner in corners])
+        ends[missed] = first_along(scene, [corner[missed] + _ASIDE for corner in corners])
     ends = np.where(np.isfinite(ends), ends, corners[-1])
-    on_sea = first_along(scene, scene.surfaces, [start, at(LevelSea((1.0,)), trough)])
+    on_sea = first_along(scene, [start, at(LevelSea((1.0,)), trough)], scene.surfaces)
     corners[1], corners[-1] = np.where(np.isfinite(on_sea), on_sea, corners[1]), ends
     # Where a ray has met a solid it stays.
     corners[1:] = [np.where(corner[:, 2:] < ends[:, 2:], ends, corner) for corner in corners[1:]]

@@ -324,11 +324,15 @@ def axis_on_bottom(scene: WaterScene, origins: FloatArray, axes: FloatArray) -> 
     return _first_along(scene.bottoms_alone, [origins, *corners]) + scene.frame_origin
 
 
-def first_along(scene: WaterScene, shapes: Sequence[mi.Shape], corners: Sequence[FloatArray]) -> FloatArray:
-    """Return where lines through corners in the frame [m], shape (n, 3) each, first meet one of some shapes, or NaN."""
-    if not shapes:
-        return np.full(corners[0].shape, np.nan)
-    return _first_along(scene_of_shapes(shapes, scene.groups), corners)
+def first_along(
+    scene: WaterScene, corners: Sequence[FloatArray], shapes: Sequence[mi.Shape] | None = None
+) -> FloatArray:
+    """Return where lines through corners in the frame [m], shape (n, 3) each, first meet one of some shapes, or NaN.
+
+    The shapes are by default all solids.
+    """
+    some = scene.solids_alone if shapes is None else scene_of_shapes(shapes, scene.groups) if shapes else None
+    return np.full(corners[0].shape, np.nan) if some is None else _first_along(some, corners)
 
 
 def _first_along(some: mi.Scene, corners: Sequence[FloatArray]) -> FloatArray:

@@ -143,6 +143,11 @@ class WaterScene:
         """Scene of the bottoms."""
         return scene_of_shapes(self.bottoms, self.groups)
 
+    @cached_property
+    def solids_alone(self) -> mi.Scene | None:
+        """Scene of the solids, None without any."""
+        return scene_of_shapes(self.solids, self.groups) if self.solids else None
+
     @property
     def targets(self) -> list[mi.Shape]:
         """Solids that are not `bottoms`."""

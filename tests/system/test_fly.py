@@ -291,6 +291,9 @@ def test_infrared_pulses_give_the_surface_of_a_flight(tmp_path, in_this_process)
         "pulses": {"rate_hz": 120.0, "most": 12},
     }
     points = fly(plan, tmp_path / "flight", workers=1).load()
+    store = Store(tmp_path / "flight" / STORE)
+    gain = store.inputs(slice(0, 12))["infrared_receiver_gain_0"]
+    assert np.ptp(gain) == 0 < gain[0]
     error = (points["z"] - points["true_z"]).values
     kind, infrared = points["kind"].values, (points["quality"].values & int(Quality.INFRARED)) > 0
     bottom = kind == PointClass.BOTTOM

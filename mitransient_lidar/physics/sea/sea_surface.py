@@ -172,8 +172,8 @@ class SeaSurface:
                 _check_number_of_cells(refined_size, cell)
                 bands = None if depths is None else band_wavenumbers(state, resolution.shortest_wave)
                 given = state, period, cell, seed
-                rest = wind_direction, resolution.shortest_wave, bands
-                waves, cell, resolved = realise_heights(*given, motion, *rest)
+                rest = resolution.shortest_wave, bands
+                waves, cell, resolved = realise_heights(*given, motion, wind_direction, *rest)
                 bottom = None
                 if depths is not None and bands is not None:
                     bottom = DepthResponse.of_state(state, bands), depths
@@ -229,7 +229,7 @@ class SeaSurface:
             return self
         if time not in self._later:
             waves = self._crested
-            each = waves.cells**2 if isinstance(waves, PeriodicHeights) else _MOST_HEIGHTS
+            each = waves.size if isinstance(waves, PeriodicHeights) else _MOST_HEIGHTS
             if self._later and (len(self._later) + 1) * each > _MOST_HEIGHTS:
                 del self._later[next(iter(self._later))]
             self._later[time] = replace(self, waves=self.waves_at(time))
@@ -414,12 +414,12 @@ def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: fl
 def _waves_at(
     given: tuple[SeaState, float, float, int],
     motion: Motion,
-    rest: tuple[float, float, FloatArray | None],
+    rest: tuple[float, FloatArray | None],
     bottom: tuple[DepthResponse, BottomDepths] | None,
     time: float,
 ) -> PeriodicHeights | ShoalingHeights:
     """Return the waves of `realise_heights`, whose parameters are given, at a time [s], maybe over a bottom."""
-    waves = realise_heights(*given, replace(motion, time=time), *rest)[0]
+    waves = realise_heights(*given, replace(motion, time=time), None, *rest)[0]
     return waves if bottom is None else ShoalingHeights(waves, *bottom)
 
 

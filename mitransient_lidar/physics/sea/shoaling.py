@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitransient_lidar.core.validation import ArrayLike, FloatArray
-from mitransient_lidar.physics.sea.realization import PeriodicHeights
+from mitransient_lidar.physics.sea.realization import Interpolation, PeriodicHeights
 from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.wind_spectra import ShallowSpectrum, SwellSpectrum
 
@@ -165,18 +165,28 @@ class ShoalingHeights:
         table, top = self.response.amplitude, self.response.top
         place = np.interp(self.depths.sample(x, y), self.response.depth, np.arange(table.shape[1]))
         index = np.minimum(place.astype(np.intp), table.shape[1] - 2)
-        place -= index
-        used = slice(int(index.min()), int(index.max()) + 2)
+        used = np.arange(index.min(), index.max() + 2)
 
-        def at(row: FloatArray) -> FloatArray:
-            return np.asarray(row[index] + (row[index + 1] - row[index]) * place)
+        def at(row: FloatArray) -> FloatArray | float:
+            if np.ptp(row[used]) == 0:
+                return float(row[used[0]])
+            return np.asarray(row[index] + (row[index + 1] - row[index]) * (place - index))
 
-        heights = self.waves.sample(x, y) * at(table[top])
-        for number, band in self.waves.bands:
-            excess = table[number] - table[top]
-            if np.any(excess[used]):
-                heights += band.sample(x, y) * at(excess)
-        return np.asarray(heights)
+        heights = np.asarray(self.waves.sample(x, y) * at(table[top]))
+        bands = [(number, band) for number, band in self.waves.bands if np.any(table[number, used] != table[top, used])]
+        for period in dict.fromkeys(band.period for _, band in bands):
+            numbers, own = zip(*((number, band) for number, band in bands if band.period == period), strict=True)
+            grid = Interpolation.of_waves(max(band.reach for band in own), period, x, y)
+            waves, excess = np.array([band.at_points(grid) for band in own]), table[list(numbers)] - table[top]
+            if used.size <= len(own):
+                # All bands together at each depth of the table, between which amplitudes are linear.
+                for depth in used:
+                    share = np.maximum(1 - np.abs(place - depth), 0)
+                    heights += share * grid.between(np.tensordot(excess[:, depth], waves, 1))
+            else:
+                for row, one in zip(excess, waves, strict=True):
+                    heights += at(row) * grid.between(one)
+        return heights
 
 
 def limited_wake(

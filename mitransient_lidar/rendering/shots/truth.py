@@ -172,7 +172,7 @@ def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPose
     on_land = depth + height < 0
     if lidar.empty_heights[0] > 0 and np.all(axes[..., 2] < 0) and not lidar.submerged:
         at_sea = origins - axes * (origins[:, 2:] / axes[..., 2:])
-        on_solid = first_along(lidar, lidar.solids, [origins, at_sea])[:, 2] > height
+        on_solid = first_along(lidar, [origins, at_sea])[:, 2] > height
         depth = np.where(on_solid & ~on_land, np.nan, depth)
         on_land |= on_solid
     of_sea = {"true_slope_along": along, "true_slope_across": across, "true_surface_height": height}
@@ -223,7 +223,7 @@ def solids_below(lidar: LidarScene, x: FloatArray, y: FloatArray) -> tuple[Float
     heights = [float(z) for solid in lidar.solids for z in (solid.bbox().min.z, solid.bbox().max.z)]
     places = np.stack([x, y], axis=1) - lidar.frame_origin[:2]
     line = [np.insert(places, 2, z, axis=1) for z in (max(heights, default=0.0) + 1, min(heights, default=0.0) - 1)]
-    highest, target = (first_along(lidar, shapes, line)[:, 2] for shapes in (lidar.solids, lidar.targets))
+    highest, target = (first_along(lidar, line, shapes)[:, 2] for shapes in (None, lidar.targets))
     return highest, highest == target
 
 

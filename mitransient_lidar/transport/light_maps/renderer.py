@@ -33,7 +33,7 @@ from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.probe import Rays, first_along
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.solids import box_of, met_shape, scene_of_shapes
+from mitransient_lidar.transport.solids import box_of, met_shape
 
 #: Numbers of the random sequences within a pass.
 _BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS = range(5)
@@ -182,7 +182,7 @@ class LightMapRenderer(PassRenderer):
         self._turned = aligned(mi.Float, np.array(turned, np.float32))
         self._ripples = scene.seas[0].rippled(scene.refractive_index) if level else scene.surfaces[0].bsdf()
         self._sea = HeightFields.about(scene, level=level)
-        self._solids = scene_of_shapes(scene.solids, scene.groups) if scene.solids else None
+        self._solids = scene.solids_alone
 
     @property
     def path_count(self) -> int:
@@ -415,7 +415,7 @@ def over_water(scene: LidarScene, places: FloatArray, turns: FloatArray | None) 
         level = np.stack([away.real, away.imag], axis=-1) + places[:, np.newaxis]
         return np.insert(level.reshape(-1, 2), 2, np.tile(points[some, 2], len(places)), axis=1)
 
-    met = first_along(scene, scene.solids, [among_solids(start), among_solids(end)])[:, 2]
+    met = first_along(scene, [among_solids(start), among_solids(end)])[:, 2]
     return np.asarray(np.isnan(met).reshape(len(places), -1).all(axis=1))
 
 

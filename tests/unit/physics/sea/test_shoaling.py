@@ -155,3 +155,16 @@ def test_wakes_stay_within_a_quarter_of_the_depth():
 def test_following_the_bottom_needs_a_spectrum(spectrum, more):
     with pytest.raises(UserError, match="shoaling = 'bottom' needs a spectrum of waves"):
         over(level(1.0), spectrum=spectrum, **more, shoaling="bottom")
+
+
+@pytest.mark.parametrize("slope", [0.001, 0.2])
+def test_bands_together_are_those_one_by_one(slope):
+    """Between few depths of the table, bands are added before they are interpolated; over many each is on its own."""
+    sea = over(beach(slope), wind_speed=8.0, shoaling="bottom", **SPECTRUM)
+    x = -0.5 / slope + np.arange(-8, 8) * 0.25
+    response, depth = sea.waves.response, beach(slope).sample(x, x)
+    amplitude = [np.interp(depth, response.depth, row) for row in response.amplitude]
+    expected = sea.waves.waves.sample(x, x) * amplitude[response.top]
+    for number, band in sea.waves.waves.bands:
+        expected += (amplitude[number] - amplitude[response.top]) * band.sample(x, x)
+    np.testing.assert_allclose(sea.heights(x, x), expected, atol=1e-6)
