@@ -61,7 +61,7 @@ class FirstEchoes:
     film_ns: FloatArray  #: Delay by water on land, root mean square over land and bottom [ns], shape (n,).
 
     def part(self, rows: BoolArray) -> FirstEchoes:
-        """Return the priors of some records."""
+        """Return the first echoes of some records."""
         bottom, surface = (
             Echoes(**{name: value[rows] for name, value in vars(one).items()}) for one in (self.bottom, self.surface)
         )
