@@ -124,7 +124,8 @@ def test_all_targets_of_a_waveform_are_listed():
         assert float(own["time_ns"].sel(echo="bottom")) - SURFACE == pytest.approx(70, abs=0.1)
     assert echo_table.extract(result(np.stack(shots)), targets=1)["echo"].values.tolist() == list(echo_table.ECHOES)
     # In blocks with different numbers of targets, too.
-    xr.testing.assert_identical(echo_table.extract(result(np.stack(shots)), block=1), table)
+    blocks = echo_table.extract(result(np.stack(shots)), block=1)
+    xr.testing.assert_identical(*(one.assign_attrs(history="") for one in (blocks, table)))  # without their times
 
 
 @pytest.mark.parametrize("rise", [1.5, 3.0])
