@@ -202,8 +202,8 @@ _MOST_PIXELS, _MOST_LINES = 64, 17
 #: Length of rays that meet nothing under water, and depth of those from the air in a scene without solids [m].
 _REACH, _DEPTH = 20.0, 10.0
 
-#: Smallest sine below the horizon of rays that are followed, and displacement of those that meet edges [m].
-_SMALLEST_DESCENT, _ASIDE = 1e-3, (1e-4, 0.7e-4, 0.0)
+#: Smallest sine below the horizon of rays that are followed.
+_SMALLEST_DESCENT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,9 +313,6 @@ def traced(scene: WaterScene, pose: KernelPose, angles: FloatArray) -> FloatArra
 
     corners = [start, *(at(sea, z) for z in levels)]
     ends = first_along(scene, corners)
-    # Rays in single precision may pass between two triangles where they meet an edge: those beside them do not.
-    if (missed := np.isnan(ends[:, 0])).any():
-        ends[missed] = first_along(scene, [corner[missed] + _ASIDE for corner in corners])
     ends = np.where(np.isfinite(ends), ends, corners[-1])
     on_sea = first_along(scene, [start, at(LevelSea((1.0,)), trough)], scene.surfaces)
     corners[1], corners[-1] = np.where(np.isfinite(on_sea), on_sea, corners[1]), ends

@@ -23,6 +23,9 @@ from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.solids import box_of, met_numbers, scene_of_shapes
 
+#: Displacement of rays that pass between faces [m].
+_ASIDE = (1e-4, 0.7e-4, 0.0)
+
 #: Rays in a view and in a beam; Gaussian beam rays reach 4.2 standard deviations.
 PROBE_RAYS = 4096
 
@@ -337,6 +340,15 @@ def first_along(
 
 def _first_along(some: mi.Scene, corners: Sequence[FloatArray]) -> FloatArray:
     """Return where lines first meet a shape of a scene, as `first_along`."""
+    found = _met_along(some, corners)
+    # Rays in single precision may pass between two triangles where they meet an edge: those beside them do not.
+    if (missed := np.isnan(found[:, 2])).any():
+        found[missed] = _met_along(some, [corner[missed] + _ASIDE for corner in corners])
+    return found
+
+
+def _met_along(some: mi.Scene, corners: Sequence[FloatArray]) -> FloatArray:
+    """Return where lines first meet a face of a scene, as `first_along`."""
     found = np.full(corners[0].shape, np.nan)
     active = aligned(mi.Bool, np.ones(len(found), dtype=bool))
     for start, end in itertools.pairwise(corners):

@@ -9,7 +9,6 @@ from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, positive
@@ -276,6 +275,8 @@ class Band:
     @functools.cached_property
     def _grid(self) -> npt.NDArray[np.float32]:
         """What to interpolate at the points of all periods [m], shape (cells, cells) along y and x."""
+        from scipy import fft
+
         cells, number = _cells_of(self.reach), np.arange(-self.reach, self.reach + 1)
         share = _shares(self.reach, cells)
         waves = np.zeros((cells, self.reach + 1), dtype=np.complex64)

@@ -6,6 +6,7 @@ import pytest
 import significance
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.probe import first_along
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.solids import box_rays
 
@@ -108,3 +109,19 @@ def test_rays_meet_every_side_of_a_box():
     assert (np.abs(directions).sum(axis=1) == 1).all()
     # Along a flat box they would meet edges alone.
     assert len(box_rays(np.zeros(3), np.array([1.0, 2, 0]), 4)[0]) == 2 * 4**2
+
+
+def test_lines_along_edges_meet_the_mesh(lidar_scene, tmp_path):
+    """Some of them pass between both faces in single precision: a flight was refused, since its bottom had a gap."""
+    side = np.linspace(-500, 500, 41)
+    places = [f"v {x} {y} {-8 + 0.3 * np.sin(x)}" for y in side for x in side]
+    corners = [41 * row + column + 1 for row in range(40) for column in range(40)]
+    faces = [f"f {a} {a + 1} {a + 42}\nf {a} {a + 42} {a + 41}" for a in corners]
+    (tmp_path / "reef.obj").write_text("\n".join(places + faces))
+    scene = lidar_scene(extra={"reef": {"type": "obj", "filename": str(tmp_path / "reef.obj")}})
+    found = find_lidar_scene(scene, scene.sensors()[0])
+    reef = [solid for solid in found.solids if solid.id() == "reef"]
+    rng = np.random.default_rng(significance.seed_shift)
+    x, y = rng.uniform(-400, 400, 2**17), rng.normal(scale=1e-7, size=2**17)
+    start, end = (np.stack([x + aside, y, np.full_like(x, z)], axis=1) for aside, z in ((-54, 200), (3, -10)))
+    assert np.isfinite(first_along(found, [start, end], reef)).all()
