@@ -19,8 +19,8 @@ _WIDE = 20.0  # largest over smallest ratio from which on the axis is logarithmi
 def plot_bounds(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw a result of `studies.bounds.bounds`.
 
-    For several designs, a panel per parameter ranks them by the ratio of their bound to the first, best on top, at most
-    20. For a single design, the bounds stand beside the bounds with the other parameters known, and the correlations.
+    For several designs, a panel per parameter ranks them by their bound's ratio to the first, best on top, at most 20.
+    For a single design, the bounds stand beside the bounds with the other parameters known, and the correlations.
     """
     if found.sizes["design"] == 1:
         return _plot_one(found.isel(design=0), path)
