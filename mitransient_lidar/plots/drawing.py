@@ -56,7 +56,7 @@ class _PageFigure(Figure):
 
 
 def make_legible(figure: Figure, renderer: Any) -> None:
-    """Enlarge a figure's texts to 7 pt at a page's width, and move legends from data to the right."""
+    """Enlarge a figure's texts to 7 pt at a page's width, wrap its title, and move legends from data to the right."""
     least = _LEAST_POINTS * figure.get_figwidth() / _PAGE_INCHES
     for ax in [one for parent in figure.axes for one in (parent, *parent.child_axes)]:
         for axis in (ax.xaxis, ax.yaxis):
@@ -64,6 +64,8 @@ def make_legible(figure: Figure, renderer: Any) -> None:
                 axis.set_tick_params(which="both", labelsize=least)
     for text in figure.findobj(Text):
         text.set_fontsize(max(float(text.get_fontsize()), least))
+    for text in figure.texts:
+        text.set_wrap(not text.get_rotation())
     legends = [(ax, legend) for ax in figure.axes if (legend := ax.get_legend())]
     if legends and (layout := figure.get_layout_engine()):
         layout.execute(figure)

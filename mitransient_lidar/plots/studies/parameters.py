@@ -133,5 +133,5 @@ def plot_fit(fitted: xr.Dataset, path: drawing.FilePath | None = None) -> Figure
     finish(lower, zero=0, xlim=limits, xlabel=drawing.TIME_LABEL, ylabel=label)
     columns = (fitted[name].values for name in ("parameter", "value", "stderr"))
     text = ", ".join(f"{name} {value:.4g} ± {error:.2g}" for name, value, error in zip(*columns, strict=True))
-    figure.suptitle(drawing.titled(fitted.attrs, text), fontsize="medium", wrap=True)
+    figure.suptitle(drawing.titled(fitted.attrs, text), fontsize="medium")
     return drawing.save(figure, path)

@@ -87,7 +87,7 @@ def draw_sea(ax: Axes, rendered: RenderedShots, first: int = 1) -> None:
     ax.set_aspect("equal")
     turn = math.degrees(rendered.azimuth)
     beam = "+x" if abs(turn) < 1e-4 else f"{abs(turn):.3g}° from +x towards {'+' if turn > 0 else '-'}y"
-    ax.set_title(f"seen from above; the beam points to {beam}", fontsize="small")
+    ax.set_title(f"from above, beam along {beam}", fontsize="small")
     ax.set(xlabel="x (m)", ylabel="y (m)")
 
 
