@@ -133,7 +133,7 @@ def draw_pixels(path: Path) -> None:
             for loop in loops:
                 ax.add_patch(Polygon(1e3 * loop[:, ::-1], facecolor=colour, alpha=0.35, edgecolor="white"))
             label = f"{index}\n{NAMES[index]}" if pixels.count == 4 else f"{index}"
-            label = f"{index // 6}, {index % 6}" if layout == "4x6" else label
+            label = f"{index // 6},{index % 6}" if layout == "4x6" else label
             ax.text(centre[1], centre[0], label, ha="center", va="center", fontsize=9)
         ax.set_title(f"{layout}: row, column" if layout == "4x6" else layout, fontsize="medium")
         ax.set(xlim=(16.5, -16.5), ylim=(-16.5, 16.5), aspect="equal", xlabel="left, angle_y (mrad)")
@@ -153,7 +153,7 @@ def draw_widths(path: Path) -> None:
         half = sigma * np.sqrt(-2 * np.log(level))
         arrow(beam, (-half, level), (half, level), DIM, both=True)
         beam.text(half + 1, level, f"{name}, {2 * half:.1f} mrad", fontsize=9, va="center")
-    beam.set(xlabel="angle from the axis (mrad)", ylabel="irradiance over its peak", xlim=(-16, 40), ylim=(0, 1.08))
+    beam.set(xlabel="angle from the axis (mrad)", ylabel="irradiance over its peak", xlim=(-16, 57), ylim=(0, 1.08))
     beam.set_title("One Gaussian beam and its three widths")
 
     fwhm, width = 5.0, 1.0
