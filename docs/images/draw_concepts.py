@@ -1,6 +1,6 @@
 """Draws the pictures of docs/concepts.md: ``python docs/images/draw_concepts.py [FOLDER]``, some seconds.
 
-Directions, pixels and the record are those of the program: rays are refracted by `physics.lidar`, pixels come from the
+Directions, pixels and the record are the program's own. Rays are refracted by `physics.lidar`, pixels come from the
 plugin ``multipixel_receiver``, and the record is a render.
 """
 
@@ -115,7 +115,7 @@ def draw_frame(path: Path) -> None:
 
 
 def draw_pixels(path: Path) -> None:
-    """Draw the pixels of four layouts as the lidar sees them."""
+    """Draw the pixels in four layouts as the lidar sees them."""
     import mitsuba as mi
 
     from mitransient_lidar.transport.sensor.outlines import pixel_outlines
@@ -142,7 +142,7 @@ def draw_pixels(path: Path) -> None:
 
 
 def draw_widths(path: Path) -> None:
-    """Draw the definitions of the width of a beam, and a pulse in bins."""
+    """Draw how a beam's width is defined, and a pulse in bins."""
     figure = drawing.new_figure(path, 11, 3.6)
     beam, pulse = figure.subplots(1, 2)
     sigma = 5.0
@@ -175,7 +175,7 @@ def draw_widths(path: Path) -> None:
 
 
 def draw_record(path: Path) -> None:
-    """Draw the record of one pixel over a level sea: energy by bin and power after the pulse, with both axes."""
+    """Draw one pixel's record over a level sea: energy by bin and power after the pulse, with both axes."""
     params = {"layout": "1x1", "spectrum": "flat"}
     shot = mitransient_lidar.render("table1", params=params, passes=64, seed=1).isel(pixel=0)
     figure = drawing.new_figure(path, 11, 4.2)

@@ -1,7 +1,7 @@
 """Draw the case ``cloud`` beside an approximate two-stream model: ``python docs/intercomparison/cloud.py``.
 
-Energies become apparent backscatter of the full-size cloud, E r^2 / (E0 A dr) with the range r, and means over eight
-gates of 15 m are compared with the two-stream values of every eighth gate, interpolated in the logarithm.
+Energies become the full-size cloud's apparent backscatter, E r^2 / (E0 A dr) with the range r. Means over eight 15 m
+gates are compared with the two-stream values in every eighth gate, interpolated in the logarithm.
 """
 
 from __future__ import annotations
