@@ -67,8 +67,8 @@ def train_from_options(
     attributes : mapping
         A result's attributes, with the lidar geometry if the start is a depth.
     start_ns, start_depth_m, start_range_m : float, optional
-        Half height of the first gate's rising edge, as exactly one of: a time [ns], the echo time for a depth below the
-        mean sea level, or for a range from the lidar, on the receiver's axis [m].
+        Half height of the first gate's rising edge: its time [ns], or the depth below the mean sea level or range from
+        the lidar on the receiver's axis whose echo arrives then [m]; exactly one.
 
     Raises
     ------

@@ -39,8 +39,7 @@ class BlockCorrelation:
     def covariance(self, scaled: FloatArray, first: int = 0) -> FloatArray:
         """Return the covariances between k sums over the same bins, shape (..., k, k).
 
-        `scaled` are neighbouring bins' errors times their weights, shape (..., k, bins), from the record's bin `first`
-        on.
+        `scaled` are neighbouring bins' errors times their weights, shape (..., k, bins), from bin `first` on.
         """
         part = slice(first, first + scaled.shape[-1])
         own, scaled = self.block[part], scaled / np.broadcast_to(self.inflation, self.block.shape)[part]
