@@ -137,9 +137,9 @@ def render(
         Standard errors refer to the smoothed images. Only gates are kept, and passes have fewer paths by default. The
         coordinate ``gate_smoothing_bias`` estimates the change by smoothing.
     light
-        'merging' (the default), the integrator, or 'maps': the beam's light is looked up in maps at several depths
-        (`transport.light_maps.renderer`). For images over waves, layers of one index and a bottom; targets' shadows in
-        the beam are left out.
+        'merging' (the default), the integrator, or 'maps': the light of the beam is looked up in maps at several depths
+        (`transport.light_maps.renderer`). For images over waves, layers of one index and a bottom; shadows of targets
+        in the beam are left out.
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here. The previously
         active variant is active again afterwards.

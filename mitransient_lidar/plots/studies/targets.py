@@ -103,7 +103,7 @@ _GAINS = {
 def plot_detection(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the signals, the operating characteristics, the signal required for detection, and the depth error.
 
-    `found` is a result of `studies.detection.detect`. For gates: those in which the target is brightest and darkest
+    `found` is a result of `studies.detection.detect`. For gates: the gates in which the target is brightest and darkest
     against the noise, the weights in their sum, and the detection with frames and single gates.
     """
     if "gate" in found.dims:
