@@ -9,17 +9,19 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray
+from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry, snell, turn_by_slope
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
+from mitransient_lidar.physics.water.phase import petzold_average_particle
+from mitransient_lidar.physics.water.water_types import PETZOLD_BACKSCATTER_RATIO
 from mitransient_lidar.results.geometry import Attributes, LinesOfSight, lidar_system, optional_number
 
 # Constants from 40 random level seas (1 to 10 mrad, 100 to 400 m, 0 to 30 degrees off nadir, absorption 0.04 to 0.25,
 # scattering 0.02 to 0.6 1/m, 3 to 15 m deep), and of waves from shots at 4, 6 and 9 m/s.
 _LEAST = 0.0005  # relative to the depth
 _OF_RIPPLES = 0.032  # of an echo through ripples, relative to the depth, times their slope variance
-_OF_DELAY = 0.09  # of a scattered echo, relative to the depth, times sqrt(K bb) and the beam's width
 # Share of a pixel's echo that arrives with those of the other pixels. A centroid in gates includes more of its tail.
 _OF_NEIGHBOURS, _OF_GATED_NEIGHBOURS = 0.12, 0.2
 _FARTHEST_NEIGHBOUR = 1.5  # largest deviation of arrivals that counts, in pulses
@@ -30,6 +32,7 @@ _LEAST_SHARE = 0.05  # of the beam in a pixel whose column counts, relative to t
 _SMALLEST_SHARE = 1e-9  # of the beam in a pixel that results store
 _TYPICAL_ATTENUATION = 0.14  # of a column that is too short for a fit [1/m]
 _TYPICAL_BACKSCATTERING = 0.05  # relative to the attenuation of the column
+_ANGLES, _DISTANCES = (1e-3, 1.5, 160), 128  # scattering angles [rad], and distances to the bottom, of the delay
 TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
 # Slope of waves averaged over a beam of 2 m, relative to the standard deviation of all slopes; its power of the width.
 _MEAN_SLOPE, _OF_WIDTH, _WIDTH = 0.4, -0.25, 2.0
@@ -45,6 +48,7 @@ class DepthErrors:
     lines: LinesOfSight
     shots: int  #: Number of shots.
     beam_width: float  #: Diameter of the beam at e^-1/2 of its peak, or of the view if that is smaller, on the sea [m].
+    view_width: float  #: Diameter of the field of view on the sea [m], or of the beam where it is not known.
     pulse_ns: float  #: Full width of an ideal echo at half maximum [ns].
     #: Indices of the water.
     refractive_index: float
@@ -62,14 +66,15 @@ class DepthErrors:
     ) -> DepthErrors:
         """Read a result's attributes; without sea heights it has waves, without a beam a narrow one."""
         widths = [optional_number(attributes, f"{name}_mrad") for name in ("divergence", "field_of_view")]
-        width = 1e-3 * geometry.slant_range * min((one for one in widths if one is not None), default=0.0)
+        known = [1e-3 * geometry.slant_range * one for one in widths if one is not None] or [0.0]
+        width = min(known)
         lowest, highest = attributes.get("surface_heights_m", (math.nan, math.nan))
         slope, variance = mean_slope(attributes, width), _slope_variance(attributes)
         height = (highest - lowest) / HEIGHTS if math.isfinite(highest - lowest) else 0.0
         n, group = geometry.refractive_index, geometry.group_index
         gain = column_gain(attributes)
         bin_ns = rendered_bin_ns(attributes)
-        return cls(lines, shots, width, pulse_ns, n, group, slope, height, variance, gain, bin_ns)
+        return cls(lines, shots, width, known[-1], pulse_ns, n, group, slope, height, variance, gain, bin_ns)
 
     def of_surface(self, faint: BoolArray) -> FloatArray:
         """Return the time errors of surface echoes [ns], shape (n,).
@@ -114,8 +119,8 @@ class DepthErrors:
         -----
         Root sum square of:
 
-        - the delay of scattered light, 0.09 sqrt(K bb) times the beam width, relative to the depth. The backscattering
-          bb follows from the column level; for signals in volts it is 0.05 K;
+        - the delay of scattered light; see `delays`. The backscattering bb follows from the column level, and is 0.05 K
+          where no level is known;
         - the longer paths through ripples, 0.032 times the variance of the slopes, relative to the depth;
         - light scattered from other pixels: 0.12 of the arrival's deviation from the beam-weighted mean over pixels, or
           0.2 in gates;
@@ -128,10 +133,7 @@ class DepthErrors:
         lines = self.lines
         cos_air = np.cos(lines.off_nadir)
         water = snell(lines.off_nadir, self.refractive_index)
-        scattering = np.sqrt(self.attenuation_times_backscattering(attenuation, level))
         turned = self.slope * np.tan(water) * turn_by_slope(lines.off_nadir, self.refractive_index)
-        by_water = _OF_DELAY * scattering * self.beam_width + _OF_RIPPLES * self.slope_variance
-        relative = np.hypot(np.hypot(_LEAST, by_water), turned)
         pulse = self.pulse_ns / FWHM_PER_SIGMA
         resolved = np.hypot(lines.surface_spread, max(pulse, 1e-9))
         skew = _OF_SKEW * lines.surface_spread**2 / resolved
@@ -140,10 +142,50 @@ class DepthErrors:
             by_height = self.height * (1 - np.cos(water) / (self.group_index * cos_air))
             constant = np.hypot(constant, by_height)
         shape = (-1, *(1,) * (depth.ndim - 1))
+        delay = self.delays(depth, self.backscattering(attenuation, level).reshape(shape))
+        later = delay + _OF_RIPPLES * self.slope_variance * depth
+        relative = np.hypot(_LEAST, turned).reshape(shape) * depth
         share = _OF_GATED_NEIGHBOURS if gated else _OF_NEIGHBOURS
         neighbours = lines.depth_of_delay(share * self._from_all_pixels(time_ns))
-        of_pixel = np.hypot(relative.reshape(shape) * depth, constant.reshape(shape))
+        of_pixel = np.hypot(np.hypot(later, relative), constant.reshape(shape))
         return np.asarray(np.hypot(of_pixel, neighbours))
+
+    def delays(self, depth: FloatArray, backscattering: FloatArray) -> FloatArray:
+        """Return how much deeper bottoms seem by light that the water has scattered [m], in the shape of the depths.
+
+        Parameters
+        ----------
+        depth : ndarray
+            Depths [m], NaN if unknown.
+        backscattering : ndarray
+            Backscattering coefficients bb of the water [1/m], in a shape that broadcasts to that of the depths.
+
+        Notes
+        -----
+        An event by the angle t at the distance u from the bottom, on the way down or up, lengthens the path by x = u
+        (1/cos t - 1) and displaces it by r = u tan t. Each scattering counts with three factors: Petzold's
+        average-particle phase function, for bb/b of 0.0183; the share exp(-r^2/(2 s^2)) of such light in the view, with
+        s^2 = (w/2)^2 + (v/4)^2 for the beam and view diameters w and v; and exp(-x^2/(4 p^2)), by which a fit of a
+        Gaussian with the standard deviation p follows light that is later by x. The sum of b x over the events of one
+        way, half of both ways, is the delay D while it is small. Light later than an echo's width e hardly moves the
+        echo, which thus has the delay D/(1 + D/e).
+        """
+        deepest = float(np.nanmax(depth, initial=0.0))
+        metres = 0.5e-9 * C0 / self.group_index * self.pulse_ns
+        spread = math.hypot(0.5 * self.beam_width, 0.25 * self.view_width)
+        if min(deepest, metres, spread) <= 0:
+            return np.zeros(depth.shape)
+        angle = np.geomspace(*_ANGLES)
+        distance = np.linspace(0, deepest, _DISTANCES)
+        longer = distance[:, np.newaxis] * (1 / np.cos(angle) - 1)
+        away = distance[:, np.newaxis] * np.tan(angle) / spread
+        # Both ways of light that is as late as an echo's depth at half maximum.
+        late = longer * FWHM_PER_SIGMA / (2 * metres)
+        seen = 2 * np.pi * petzold_average_particle()(angle) * np.sin(angle) * np.exp(-0.5 * away**2 - 0.25 * late**2)
+        inner = np.asarray(np.trapezoid(seen * longer, angle, axis=1))
+        total = np.append(0.0, np.cumsum(0.5 * (inner[1:] + inner[:-1]))) * (distance[1] - distance[0])
+        delay = np.interp(depth, distance, total) * backscattering / PETZOLD_BACKSCATTER_RATIO
+        return np.asarray(delay / (1 + delay / metres))
 
     def of_scattered_light(self, depth: FloatArray, dark: BoolArray) -> FloatArray:
         """Return the errors of depths [m], shape (n, ...), in pixels without direct light, shape (n,), 0 in others.
@@ -158,8 +200,11 @@ class DepthErrors:
         below = np.maximum(depth, 0)
         return np.asarray(np.hypot(below, away.reshape(-1, *(1,) * (depth.ndim - 1))) - below)
 
-    def attenuation_times_backscattering(self, attenuation: FloatArray, level: FloatArray) -> FloatArray:
-        """Return the columns' K bb [1/m^2], shape (n,), with one bb for all pixels of a shot."""
+    def backscattering(self, attenuation: FloatArray, level: FloatArray) -> FloatArray:
+        """Return the backscattering coefficients of the columns [1/m], shape (n,), one for all pixels of a shot.
+
+        Without a level, those that are typical of the attenuation; parameters are those of `of_echoes`.
+        """
         known = np.where(np.isfinite(attenuation), np.maximum(attenuation, 0), _TYPICAL_ATTENUATION)
         share = self.lines.beam_share.reshape(self.shots, -1)
         power = level.reshape(share.shape)
@@ -169,9 +214,8 @@ class DepthErrors:
         # The median, as levels of faint columns may be wrong by orders of magnitude.
         some = np.where(np.isfinite(measured).any(axis=1, keepdims=True), measured, 0)
         median = np.nanmedian(some, axis=1, keepdims=True)
-        backscattering = np.broadcast_to(np.where(median > 0, median, np.nan), share.shape).ravel()
-        backscattering = np.where(np.isfinite(backscattering), backscattering, _TYPICAL_BACKSCATTERING * known)
-        return np.asarray(known * backscattering)
+        found = np.broadcast_to(np.where(median > 0, median, np.nan), share.shape).ravel()
+        return np.asarray(np.where(np.isfinite(found), found, _TYPICAL_BACKSCATTERING * known))
 
     def _from_all_pixels(self, time_ns: FloatArray) -> FloatArray:
         """Return arrivals minus their beam-weighted mean over a shot's pixels [ns].

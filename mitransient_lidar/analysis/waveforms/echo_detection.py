@@ -30,6 +30,9 @@ _BRIGHTER = 1.5  # largest signal behind a bottom, relative to it: light of wide
 _REACH = 1.5  # distance from an echo to the signal around it, in echo widths
 _BEHIND_EDGE, _STAYS = (0.8, 1.2), 0.15  # reaches behind an edge, and the share of its rise that is left there
 _LEAST_COLUMN = 0.1  # column before an edge, relative to the peak
+# Least excess at half the reach over that at the reach, as of an echo four times as wide as expected (0.25 for wide
+# humps), and standard deviations of the noise by which it must be larger.
+_NARROW, _SURE = 0.28, 1.0
 BEHIND_EDGE = _BEHIND_EDGE[0] * _REACH  #: Echo widths behind a peak from which on an edge is told by the signal.
 GAUSSIAN_AREA = float(np.sqrt(np.pi / np.log(16)))  # area of a Gaussian of unit height and unit width at half maximum
 
@@ -256,9 +259,10 @@ def find_echoes(
     is a peak. Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom,
     earlier ones are targets. Peaks below two thirds of what follows the last one are none. Peaks below a fiftieth of
     the strongest are ignored; among peaks less than an echo width apart the strongest counts. Behind the upper edge of
-    a turbid layer the signal does not fall back to the column above it: such a rise is no echo. Waves focus a shot's
-    light, so that its column has peaks. Under waves, targets rise above the column by at least half of it, and near the
-    surface also above half the column after them.
+    a turbid layer the signal does not fall back to the column above it: such a rise is no echo. Nor is a first
+    summit four times as wide as an echo in a record without a surface echo: light that was scattered to a pixel beside
+    the beam rises and falls slowly. Waves focus a shot's light, so that its column has peaks. Under waves, targets rise
+    above the column by at least half of it, and near the surface also above half the column after them.
 
     Parameters
     ----------
@@ -331,6 +335,10 @@ def find_echoes(
         own[(own <= 1.5 * threshold * noise) | (own <= contrast * power)] = -np.inf
         peaks, excess = peaks | np.isfinite(own), np.maximum(excess, own)
     peaks &= ~_is_edge(power, noise, peaks & beyond, reach, threshold, tail)
+    alone = np.flatnonzero(late)
+    error = np.broadcast_to(noise, power.shape)[alone]
+    summit = power[alone] >= np.maximum.accumulate(power[alone], axis=1) - threshold * error
+    peaks[alone] &= ~(summit & _is_hump(np.maximum(power[alone], 0), error, reach))
     # Much weaker peaks are in the tail of a strong echo.
     peaks &= excess > _FAINT * np.max(np.where(peaks, excess, 0), axis=1, keepdims=True)
 
@@ -399,6 +407,16 @@ def _is_edge(
     dark = before < np.maximum(_LEAST_COLUMN * behind[:, 0], threshold * error)
     edges[rows, places] = stays & falls & ~dark
     return edges
+
+
+def _is_hump(power: FloatArray, noise: FloatArray, reach: int) -> BoolArray:
+    """Return where the excess of a signal, shape (n, time), over neighbours grows with the square of their distance."""
+
+    def excess(lag: int) -> FloatArray:
+        padded = np.pad(power, ((0, 0), (lag, lag)), mode="edge")
+        return np.asarray(power - np.sqrt(padded[:, : -2 * lag] * padded[:, 2 * lag :]))
+
+    return excess(max(round(0.5 * reach), 1)) < _NARROW * excess(reach) + _SURE * noise
 
 
 def _first_peak(power: FloatArray, noise: FloatArray, threshold: float, allowed: BoolArray) -> IntArray:

@@ -10,6 +10,7 @@ import mitransient_lidar
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
+from mitransient_lidar.physics.water.phase import petzold_average_particle
 from mitransient_lidar.results.geometry import LinesOfSight
 
 N, GROUP, C0 = 1.34, 1.364, 0.299792458
@@ -94,6 +95,39 @@ def test_scattered_light_counts_with_the_beam_inside_the_view():
     assert of_depth(errors(field_of_view_mrad=5.0), attenuation=0.2)[0] < 0.6 * wide
     # A tenth of a percent to two percent of the depth, as measured for waters of this attenuation.
     assert 0.001 < wide / 8 < 0.02
+
+
+def test_a_long_pulse_in_a_wide_view_is_late_by_all_detours():
+    """One event per way at a uniform distance u from the bottom, for which Petzold's angles are drawn."""
+    rng = np.random.default_rng(3)
+    angle = np.geomspace(1e-4, 1.5, 4000)
+    density = 2 * np.pi * petzold_average_particle()(angle) * np.sin(angle)
+    share = np.append(0.0, np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(angle)))
+    drawn = np.interp(rng.random(200_000) * share[-1], share, angle)
+    detour = 8 * rng.random(drawn.size) * (1 / np.cos(drawn) - 1)
+    # Two ways, half of whose length is depth, with b d events each; Petzold's bb/b.
+    expected, error = (0.002 / 0.0183 * 8 * share[-1] * of for of in (detour.mean(), detour.std() / drawn.size**0.5))
+    one = replace(errors(), beam_width=1e5, pulse_ns=1e5)
+    found = one.delays(np.array([8.0, np.nan]), np.array([0.002, 0.002]))
+    assert abs(found[0] - expected) < 4 * error + 0.01 * expected
+    assert np.isnan(found[1])
+    assert one.delays(np.array([8.0]), np.array([0.2]))[0] == pytest.approx(100 * found[0], rel=0.01)
+    # A narrow view, or a short pulse, has less of this light.
+    for less in ({"beam_width": 1.0, "view_width": 2.0}, {"pulse_ns": 2.0}):
+        assert replace(one, **less).delays(np.array([8.0]), np.array([0.002]))[0] < 0.6 * found[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("water", "depth"), [("1C", 7.0), ("5C", 4.0), ("7C", 4.0)])
+def test_delay_of_a_rendered_bottom_is_stated(water, depth):
+    """Bottoms seem too deep by the scattering delay, stated for powers and for voltages, from the column's level."""
+    params = {"bottom_depth": depth, "spectrum": "flat", "jerlov": water}
+    shot = mitransient_lidar.render("table1", params, passes=2, instrument="published_airborne", seed=5)
+    for light in (shot, mitransient_lidar.record(shot, shots=8, seed=1)):
+        bottom = echo_table.extract(light, depth_from="mean").sel(echo="bottom")
+        late = bottom["depth_m"] - depth
+        ratio = float(late.mean() / np.sqrt((bottom["depth_m_method_error"] ** 2).mean()))
+        assert 0.6 < ratio < 1.3
 
 
 @pytest.mark.parametrize("depth", [3.0, 12.0, 20.0])

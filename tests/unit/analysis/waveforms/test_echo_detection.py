@@ -177,6 +177,19 @@ def test_a_ripple_on_the_rise_of_scattered_light_is_no_bottom():
     assert TIME[found.bins[2][1]] == pytest.approx(150, abs=DT)
 
 
+def test_a_wide_hump_beside_the_beam_is_no_bottom_but_a_stretched_echo_is_one():
+    """Light scattered to a pixel without a surface echo, in noise of a sixtieth; without its shape, 157 would be."""
+    rng = np.random.default_rng(4)
+    noise = 1 / 60 * rng.normal(size=(200, TIME.size))
+    for wider, most, least in ((7.0, 60, 0), (2.0, 200, 195), (1.0, 200, 200)):
+        signal = np.exp(-0.5 * ((TIME - 90) / (wider * SIGMA)) ** 2) + noise
+        found = find_echoes(Records.of(signal, TIME, 1 / 60), FWHM, latest_ns=40.0)
+        assert least <= np.count_nonzero(found.bins[2] >= 0) <= most
+    # A clipped echo has a flat summit.
+    flat = np.minimum(30 * np.exp(-0.5 * ((TIME - 90) / SIGMA) ** 2), 1)[np.newaxis]
+    assert find_echoes(Records.of(flat, TIME, 0.001), FWHM, latest_ns=40.0).bins[2][0] >= 0
+
+
 def test_a_bottom_at_any_distance_from_the_surface_is_one_echo():
     """Near the surface another criterion holds, whose border cuts through some of the echoes."""
     arrivals = np.arange(55, 90, 0.25)
