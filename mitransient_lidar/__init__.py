@@ -82,7 +82,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.fit import fit
     from mitransient_lidar.studies.forecast import forecast
-    from mitransient_lidar.studies.light_classes import estimate, fov_sweep, scattering_orders
+    from mitransient_lidar.studies.light_classes import fov_sweep, scattering_orders
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
@@ -96,7 +96,6 @@ _FUNCTIONS = {
     "depth_image": ("analysis.gates.range_images", "depth_image"),
     "detect": ("studies.detection", "detect"),
     "echoes": ("analysis.waveforms.echo_table", "extract"),
-    "estimate": ("studies.light_classes", "estimate"),
     "figures": ("plots.publication.figures", "figures"),
     "fit": ("studies.fit", "fit"),
     "fly": ("flights.fly", "fly"),
@@ -125,7 +124,12 @@ _FUNCTIONS = {
 }
 
 #: Former names of functions, and those that have taken their place.
-_FORMER = {"depth_uncertainty": "tpu", "sweep": "campaign", "waveforms": "echoes"}
+_FORMER = {
+    "depth_uncertainty": "tpu",
+    "estimate": "render with light='level' and components=True",
+    "sweep": "campaign",
+    "waveforms": "echoes",
+}
 
 #: Without `open`, so that ``from mitransient_lidar import *`` leaves the one of Python alone.
 __all__ = [
@@ -140,7 +144,6 @@ __all__ = [
     "depth_image",
     "detect",
     "echoes",
-    "estimate",
     "figures",
     "fit",
     "fly",

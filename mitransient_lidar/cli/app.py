@@ -30,6 +30,7 @@ from mitransient_lidar.core.errors import UserError
 RENAMED = {
     "sweep": "campaign",
     "waveforms": "echoes",
+    "estimate": "render --light level --components",
     "plot": "view --plot",
     "shot-statistics": "shots --figure",
     "instruments": "scenes instruments",

@@ -95,17 +95,6 @@ _study(
     name="detection",
 )
 _study(
-    _LIGHT,
-    "studies.light_classes:estimate",
-    "waveforms:plot_components",
-    "describe_estimate",
-    "table1 --instrument riegl_vq840g",
-    """Estimate the waveforms in about a second, over a level sea.
-
-    Looks up the light in maps of the beam: a first look, and a second opinion on a render.
-    """,
-)
-_study(
     _DESIGN,
     "studies.bounds:bounds",
     "studies.parameters:plot_bounds",

@@ -36,12 +36,9 @@ from mitransient_lidar.physics.lidar.axis_limits import system_attenuation
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.water.water_types import InherentProperties
-from mitransient_lidar.rendering.accumulators import PassAccumulator
-from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
-from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
+from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.results.attributes import label
-from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
 from mitransient_lidar.transport.medium.water_phases import table_of
 from mitransient_lidar.transport.paths.passes import MOST_ORDERS, PathClasses
 from mitransient_lidar.transport.scene import LidarScene
@@ -49,70 +46,6 @@ from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.fov_shapes import Sector
 from mitransient_lidar.transport.sensor.pixels import ShapedPixels
 from mitransient_lidar.transport.sensor.receiver import Receiver
-
-#: Independent passes, for standard errors.
-_PASSES = 8
-
-#: Largest number of paths.
-_MOST_PATHS = 2**22
-
-
-@checked
-@alone
-def estimate(
-    scene: Scene,
-    params: Mapping[str, Any] | None = None,
-    *,
-    instrument: Instrument = None,
-    paths: Annotated[int, Option("Number of paths of the light", 64, _MOST_PATHS)] = 2**13,
-    seed: Seed = 0,
-) -> xr.Dataset:
-    """Estimate the waveforms of a scene in about a second, as a first look and a second opinion.
-
-    Returns
-    -------
-    xarray.Dataset
-        As of `rendering.render.render` with ``components``.
-
-    Raises
-    ------
-    UserError
-        If the scene is invalid, or not one that light maps are for (`transport.light_maps.renderer.unsuited`); if a
-        number is out of range.
-
-    Notes
-    -----
-    Light is looked up in maps of the beam (`transport.light_maps.renderer`). The sea is level, with all of its slopes
-    as ripples, so that the result is a mean over seas, enhanced by the focusing of all waves
-    (`physics.sea.double_passage`). Light that turns more than once between down and up is missing, as are the sides
-    and shadows of solids.
-    """
-    session = open_scene(scene, params, instrument=instrument)
-    lidar = find_lidar_scene(session.scene, session.sensor)
-    renderer = LightMapRenderer(lidar, PathClasses(), level=True).by_origin()
-    session.tell_axis(lidar.axis, lidar.record_end)
-    window = ErrorWindow.of_probe(renderer.probe)
-    accumulator = PassAccumulator(lidar, window, origins=renderer.classes.names)
-    for number in np.random.SeedSequence(seed).generate_state(_PASSES):
-        accumulator.add(renderer.render_pass(int(number), paths=paths // _PASSES).histogram)
-    accumulator.require_light(_PASSES)
-    described = describe_scene(renderer.probe, window, renderer.focusing)
-    attributes = session.attributes(lidar, model="estimate", paths=paths, seed=seed, **described)
-    return with_lines_of_sight(accumulator.dataset(attributes), lidar)
-
-
-def describe_estimate(found: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a result of `estimate`: energy, and peak power with its time, by origin."""
-    energy, power = found["impulse_response_by_origin"], found["waveform_by_origin"]
-    over = [dim for dim in power.dims if dim not in ("origin", "time")]
-    columns = (("all pixels", "<12"), ("energy (J)", ">12.3e"), ("peak (W)", ">12.3e"), ("at (ns)", ">10.1f"))
-    rows = []
-    for name in found["origin"].values:
-        received, curve = float(energy.sel(origin=name).sum()), power.sel(origin=name).sum(over)
-        peak = (float(curve.max()), float(curve["time"][int(np.argmax(curve.values))]))
-        rows.append((str(name), received, *(peak if received > 0 else ())))
-    return table_lines(columns, rows)
-
 
 _REVERSALS = ("one", "several")
 

@@ -11,7 +11,7 @@ from command_line import GROUP, assert_refused, run, stub
 from rows import each_row
 
 from mitransient_lidar import results
-from mitransient_lidar.cli.app import COMMANDS
+from mitransient_lidar.cli.app import COMMANDS, RENAMED
 from mitransient_lidar.cli.generator import function_at
 from mitransient_lidar.core.options import declared
 from mitransient_lidar.results import files
@@ -213,7 +213,7 @@ def test_a_store_is_completed_with_its_options(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [("sweep", "campaign"), ("waveforms", "echoes"), ("plot", "view --plot"), ("shot-statistics", "shots --figure")],
+    list(RENAMED.items()),
 )
 def test_former_names_are_refused_with_the_new_one(old, new):
     assert_refused(run(old, "a.nc"), f"the command {old} is now {new}")

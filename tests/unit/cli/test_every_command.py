@@ -25,7 +25,6 @@ SCENE_COMMANDS = {
     "find-shots": ["--no-waveforms"],
     "target-signal": ["--passes", 16],
     "detect": ["--passes", 16, "--shots", 1000, "--renders", 3],
-    "estimate": [],
     "bounds": ["--free", "attenuation,bottom_reflectance", "--over", "layout=1x1,2x2", "--renders", 2, "--passes", 2],
     "beam-spread": ["--depths", "2,5", "--passes", 2],
     "fov-sweep": ["--fov-mrad", "20,35", "--passes", 8],

@@ -53,7 +53,6 @@ CASES = {
     "find-shots": figure("table1", files=["png"]),
     "target-signal": figure("fig13_2x2", files=("pdf", "nc")),
     "detect": figure("fig13_2x2"),
-    "estimate": figure("table1"),
     "depth-bias": (
         ["riegl_vq840g", *WRONG, "-o", "d/t.nc", "--figure", "d/t.png"],
         ["d/t.nc", "d/t.png"],
@@ -219,25 +218,27 @@ def small_figures(monkeypatch):
 @pytest.mark.usefixtures("small_figures")
 @pytest.mark.slow
 def test_line_names_what_differs(folder):
-    first = ["estimate", "table1", "--paths", 64, "-o", "d/a.png"]
+    few = ["--depths", 2, "--passes", 2, "-o", "d/a.png"]
+    first = ["beam-spread", "table1", *few]
     assert line(run(*first)) == []
-    done = run(*first[:2], "-D", "wind_speed=6", "--paths", 128, "-o", "d/a.png")
-    assert line(done) == ["replaces d/a.nc and 1 more: wind_speed 3 -> 6, paths 64 -> 128"]
-    assert_refused(run("estimate", "fig09_2x2", "-o", "d/a.png"), "since its scene is table1")
-    mounted = ["estimate", "table1", "--instrument", "riegl_vq840g", "-o", "d/a.png"]
+    done = run(*first, "-D", "wind_speed=6", "--photons", 2048)
+    assert line(done) == ["replaces d/a.nc and 1 more: wind_speed 3 -> 6, photons 65536 -> 2048"]
+    assert_refused(run("beam-spread", "fig09_2x2", *few), "since its scene is table1")
+    mounted = [*first, "--instrument", "riegl_vq840g"]
     assert_refused(run(*mounted), "since its instrument is another one")
-    assert_refused(run("view", "--plot", "d/a.nc"), "d/a.png is kept, since the command estimate has written it", "-o")
-    done = run("estimate", "fig09_2x2", "--paths", 64, "-o", "d/a.png", "--overwrite")
+    drawn = run("view", "--plot", "d/a.nc")
+    assert_refused(drawn, "d/a.png is kept, since the command beam-spread has written it", "-o")
+    done = run("beam-spread", "fig09_2x2", *few, "--overwrite")
     assert line(done) == ["replaces d/a.nc and 1 more: its scene is table1"]
     assert done.exit_code == 0
     # Files of one name in two folders are two scenes.
     for name in ("a", "b"):
         (folder / name).mkdir()
         run("scenes", "copy", "table1", f"{name}/lab.xml")
-    estimate = ["estimate", "--paths", 64, "-o", "d/f.png"]
-    assert run(*estimate, "a/lab.xml").exit_code == 0
-    assert_refused(run(*estimate, "b/lab.xml"), "since its scene file is ../a/lab.xml")
-    assert run(*estimate, folder / "a/lab.xml").exit_code == 0
+    few = ["beam-spread", *few[:-1], "d/f.png"]
+    assert run(*few, "a/lab.xml").exit_code == 0
+    assert_refused(run(*few, "b/lab.xml"), "since its scene file is ../a/lab.xml")
+    assert run(*few, folder / "a/lab.xml").exit_code == 0
 
 
 def test_result_of_an_earlier_release_counts_by_its_attributes(folder):
@@ -259,15 +260,15 @@ def test_result_of_an_earlier_release_counts_by_its_attributes(folder):
 @pytest.mark.usefixtures("small_figures")
 def test_file_made_meanwhile_keeps_its_name(folder, monkeypatch):
     """The new one gets another, so that no render is lost."""
-    from mitransient_lidar.studies import light_classes
+    from mitransient_lidar.studies import beam_spread
 
     def slow(*arguments, **options):
         (folder / "d/f.nc").write_text("mine")
         return found(*arguments, **options)
 
-    found = light_classes.estimate
-    stub(monkeypatch, "estimate", slow)
-    done = run("estimate", "table1", "--paths", 64, "-o", "d/f.png")
+    found = beam_spread.beam_spread
+    stub(monkeypatch, "beam-spread", slow)
+    done = run("beam-spread", "table1", "--depths", 2, "--passes", 2, "-o", "d/f.png")
     assert done.exit_code == 0
     assert "d/f.nc is kept, since no command has written it as it is: the new file is d/f_2.nc." in done.stderr
     assert (folder / "d/f.nc").read_text() == "mine"
