@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
-from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, DrawingOnly, Quiet, function_at
+from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, Quiet, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted
 from mitransient_lidar.core.options import Option
 
@@ -152,17 +152,6 @@ _study(
     table="write_maps",
     table_suffix=".tif",
 )
-
-
-@COMMANDS.add(_LIGHT, "studies.water_report:describe_water", "jerlov 3C")
-def _water(call: Call, output: DrawingOnly = None) -> None:
-    """Print the optical properties of a water and its parameters."""
-    check_figure(output)
-    with announced():
-        lines = call()
-        if output is not None:
-            function_at("plots.water:plot_water")(**call.arguments, path=output)
-        typer.echo("\n".join(lines))
 
 
 @COMMANDS.add(_SURVEY, "studies.depth_bias:depth_bias", "riegl_vq840g --winds 0,3 --depths 3,6")
