@@ -29,6 +29,7 @@ from mitransient_lidar.core.errors import UserError
 #: Former names of commands, and those that have taken their place.
 RENAMED = {
     "sweep": "campaign",
+    "target-signal": "detect --receiver none",
     "waveforms": "echoes",
     "estimate": "render --light level --components",
     "plot": "view --plot",

@@ -73,24 +73,14 @@ _study(
 )
 _study(
     _DESIGN,
-    "studies.target_signal:target_signal",
-    "studies.targets:plot_target_signal",
-    "describe_target",
-    "fig13_2x2 --grid 5",
-    """Measure a target's signal in each pixel.
-
-    Renders the scene with and without the target on the same random numbers, and combines the pixels.
-    """,
-)
-_study(
-    _DESIGN,
     "studies.detection:detect",
     "studies.targets:plot_detection",
     "describe_detection",
     "fig13_2x2 --receiver pmt --depths 6,8,10",
     """Compute the detection probability of a target.
 
-    Compares one pixel, the sum and the best combination of pixels.
+    Compares one pixel, the sum and the best combination of pixels. With --receiver none it measures the target's
+    signal in each pixel: renders the scene with and without the target on the same random numbers.
     """,
     name="detection",
 )

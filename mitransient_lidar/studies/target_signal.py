@@ -5,14 +5,13 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Instrument, Option, Scene, TargetId, checked, positive_option
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
@@ -36,24 +35,18 @@ _HALF_GATE = 1.0
 _GROUPS = 16
 
 
-@checked
 @alone
 def target_signal(
-    scene: Scene,
+    scene: Any,
     params: Mapping[str, Any] | None = None,
     *,
-    instrument: Instrument = None,
-    target_id: TargetId = "target",
-    grid: Annotated[int, Option("Target positions along each axis", 1, 15)] = 1,
-    max_offset: Annotated[float, positive_option("Largest offset of these positions along each axis", "m")] = 2.0,
-    passes: Annotated[int, Option("Number of independent passes per render", _GROUPS, 100_000)] = 64,
-    max_time: Annotated[
-        float | None,
-        positive_option(
-            "Stop before this many seconds, shared among the positions, with fewer passes, at least 16 per position"
-        ),
-    ] = None,
-    seed: Annotated[int, Option("Random seed", -(2**63), 2**63 - 1)] = 0,
+    instrument: str | None = None,
+    target_id: str = "target",
+    grid: int = 1,
+    max_offset: float = 2.0,
+    passes: int = 64,
+    max_time: float | None = None,
+    seed: int = 0,
     integrator: Any = None,
     axis: TimeAxis | None = None,
     progress: ProgressCallback | None = None,
@@ -64,13 +57,9 @@ def target_signal(
     much smaller errors than either record. The difference is the target echo, followed by the shadow in the water and
     on the bottom, which is negative.
 
-    Parameters
-    ----------
-    grid, max_offset
-        Target positions along each axis, and their largest offset from the position in the scene: the result is
-        `target_map` on a square.
-    axis
-        Time bins instead of automatic ones.
+    `grid`, `max_offset`: target positions along each axis, and their largest offset from the position in the scene [m],
+    for `target_map` on a square. `passes`: independent passes per render, at least 16. `max_time` [s]: shared among the
+    positions, with fewer passes. `axis`: time bins instead of automatic ones. Others as of `detection.detect`.
 
     Returns
     -------

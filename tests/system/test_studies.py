@@ -1,4 +1,4 @@
-"""The commands scattering-orders and target-signal."""
+"""The command scattering-orders, and detect without a receiver."""
 
 import re
 
@@ -33,3 +33,20 @@ def test_orders(scene, tmp_path):
     assert texts(plot) >= {"all", "0", "1", "2", "≥ 3", "scattering events", "several", "reversals (%)"}
     with xr.open_dataset(plot.with_suffix(".nc"), engine="h5netcdf") as found:
         assert found["waveform"].dims == ("pixel", "reversals", "order", "time")
+
+
+@pytest.mark.slow
+def test_signal_without_a_receiver(scene, tmp_path):
+    """A map of 2x2 places, whose sums are the signals of these places alone."""
+    few = [*NEAR, "--receiver", "none", "--passes", 16, "-q", "-o"]
+    done = run("detect", scene, "--grid", 2, "--max-offset", 0.5, *few, tmp_path / "map.png")
+    assert done.exit_code == 0, done.stderr
+    assert done.stdout.splitlines()[2].split()[:2] == ["target_x", "target_y"]
+    at_place = ["-D", "target_x=0.5", "-D", "target_y=-0.5"]
+    assert run("detect", scene, *at_place, *few, tmp_path / "place.png").exit_code == 0
+    with (
+        xr.open_dataset(tmp_path / "map.nc", engine="h5netcdf") as found,
+        xr.open_dataset(tmp_path / "place.nc", engine="h5netcdf") as own,
+    ):
+        place = found["combined_echo"].sel(target_x=0.5, target_y=-0.5)
+        assert place.sel(combination="sum") == own["combined_echo"].sel(combination="sum")

@@ -32,7 +32,6 @@ NEEDED = {
     "passive": ["passive_sea"],
     "record": ["RESULT", "--receiver", "apd"],
     "retrieve": ["RESULT"],
-    "target-signal": ["fig13_2x2"],
     "tpu": ["riegl_vq840g"],
     "scenes water": ["pure"],
 }

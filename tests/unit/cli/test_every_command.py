@@ -16,13 +16,12 @@ FLAT = ["-D", "spectrum=flat", "-D", "surface_size=60", "-D", "bin_width_ns=2", 
 WAVES = ["-D", "surface_size=60", "-D", "surface_cell_size=0.25", *FLAT[4:]]
 SEA_COMMANDS = ("find-shots",)
 #: Those that take most time.
-SLOW = {"detect", "target-signal", "beam-spread", "fov-sweep", "passive"}
+SLOW = {"detect", "beam-spread", "fov-sweep", "passive"}
 SLOW |= {"echoes", "frames", "scattering-orders", "bounds", "figures", "forecast"}
 
 #: Arguments of each command, after the scene or the result if it takes one.
 SCENE_COMMANDS = {
     "find-shots": ["--no-waveforms"],
-    "target-signal": ["--passes", 16],
     "detect": ["--passes", 16, "--shots", 1000, "--renders", 3],
     "bounds": ["--free", "attenuation,bottom_reflectance", "--over", "layout=1x1,2x2", "--renders", 2, "--passes", 2],
     "beam-spread": ["--depths", "2,5", "--passes", 2],

@@ -50,8 +50,7 @@ CASES = {
     ),
     "shots": (["table1", *WRONG, "-o", "d/s.nc", "--figure", "d/f.svg"], ["d/s.nc", "d/f.svg", "d/f.nc"], OTHER),
     "find-shots": figure("table1", files=["png"]),
-    "target-signal": figure("fig13_2x2", files=("pdf", "nc")),
-    "detect": figure("fig13_2x2"),
+    "detect": figure("fig13_2x2", files=("pdf", "nc")),
     "depth-bias": (
         ["riegl_vq840g", *WRONG, "-o", "d/t.nc", "--figure", "d/t.png"],
         ["d/t.nc", "d/t.png"],

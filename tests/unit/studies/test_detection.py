@@ -351,6 +351,8 @@ def test_echoes_that_are_not_recorded_are_reported(monkeypatch, late, receiver, 
         ("fig13_2x2", {"spectrum": "flat"}, {"clutter": 4}, "clutter needs waves"),
         ({}, None, {"clutter": 4}, "depths and clutter need an XML scene"),
         ("fig02_mine", GATES, {"receiver": "apd"}, r"is an image of 8x8: it needs gates and a camera \(iccd, "),
+        ("fig13_2x2", {}, {"grid": 3}, "grid = 3 maps the target's signal alone: it needs receiver = 'none'"),
+        ("fig13_2x2", {}, {"receiver": "none", "depths": [4]}, "alone: leave out depths and clutter"),
         ("fig02_mine", {}, {"receiver": "icmos"}, "scene fig02_mine has no gates, which a camera needs"),
     ],
 )
