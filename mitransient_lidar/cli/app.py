@@ -28,6 +28,9 @@ from mitransient_lidar.core.errors import UserError
 
 #: Former names of commands, and those that have taken their place.
 RENAMED = {
+    "beam-spread": "scattering --depths",
+    "fov-sweep": "scattering --fov-mrad",
+    "scattering-orders": "scattering --orders",
     "sweep": "campaign",
     "target-signal": "detect --receiver none",
     "waveforms": "echoes",

@@ -18,7 +18,7 @@ COMMANDS = Commands()
 Figure = Annotated[Path, Option("PNG, PDF or SVG file; also writes the data as .nc")]
 
 #: Headings of the help.
-_DESIGN, _LIGHT, _SURVEY = "Targets and designs", "Light in water", "Depths and their uncertainty"
+_DESIGN, _SURVEY = "Targets, designs and scattering", "Depths and their uncertainty"
 
 
 def _study(
@@ -98,33 +98,16 @@ _study(
     table="write_table",
 )
 _study(
-    _LIGHT,
-    "studies.beam_spread:beam_spread",
-    "studies.light:plot_beam_spread",
-    "describe_spread",
-    "table1 --depths 2,4,8",
-    """Measure how the laser beam spreads with depth.
-
-    Horizontal spread, delays, and share of the light within the field of view.
-    """,
-)
-_study(
-    _LIGHT,
-    "studies.light_classes:fov_sweep",
-    "studies.light:plot_fov_sweep",
-    "describe_fov_sweep",
-    "table1 --fov-mrad 5,20,80",
-    "Measure the water's attenuation at several fields of view.",
-)
-_study(
-    _LIGHT,
-    "studies.light_classes:scattering_orders",
-    "studies.light:plot_scattering_orders",
-    "describe_orders",
+    _DESIGN,
+    "studies.light_classes:scattering",
+    "studies.light:plot_scattering",
+    "describe_scattering",
     "table1 --orders 4",
-    """Separate the received light by scattering order.
+    """Measure how the water scatters the light: by order, with depth, or against the field of view.
 
-    Each order is also separated by its vertical reversals: one, or several.
+    Separates the received light by scattering order, and each order by its vertical reversals: one, or several. With
+    --depths: the horizontal spread of the laser beam, its delays, and its share within the field of view. With
+    --fov-mrad: the water's attenuation at several fields of view.
     """,
 )
 _study(

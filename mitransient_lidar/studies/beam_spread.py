@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import FewerPasses, Instrument, Numbers, Option, Scene, Seed, checked
+from mitransient_lidar.core.options import Numbers
 from mitransient_lidar.core.validation import ArrayLike, BoolArray, FloatArray
 from mitransient_lidar.loading.scenes import open_scene
-from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes
 from mitransient_lidar.results.attributes import label
@@ -52,21 +51,21 @@ _COLUMNS = (
 _COLUMN = 17
 
 
-@checked
-@alone
 def beam_spread(
-    scene: Scene,
+    scene: Any,
     params: Mapping[str, Any] | None = None,
     *,
-    depths: Annotated[Numbers, Option("Depths below the mean sea level", 0, unit="m", above=True, form="N,N,...")],
-    instrument: Instrument = None,
-    passes: Annotated[int, Option("Number of independent passes per render", 2, 10_000)] = 8,
-    max_time: FewerPasses = None,
-    photons: Annotated[int, Option("Photons per pass", 1024, 2**24)] = 2**16,
-    seed: Seed = 0,
+    depths: Numbers,
+    instrument: str | None = None,
+    passes: int = 8,
+    max_time: float | None = None,
+    photons: int = 2**16,
+    seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Trace light from the laser to horizontal planes under water, and measure its positions and delays.
+
+    Arguments as of `light_classes.scattering`.
 
     Returns
     -------

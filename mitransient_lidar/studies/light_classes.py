@@ -1,4 +1,4 @@
-"""Parts of the received light: by scattering order, in a quick estimate, and in several fields of view."""
+"""Scattered light: by scattering order, in several fields of view, and as the spread of the beam."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.retrieval.column_retrieval import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import (
-    FewerPasses,
     Instrument,
     Numbers,
     Option,
@@ -26,7 +25,7 @@ from mitransient_lidar.core.options import (
     positive_option,
 )
 from mitransient_lidar.core.tables.written import table_lines
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, integer, shown
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.document import read_document
 from mitransient_lidar.loading.parameters import plugins_of
@@ -39,6 +38,7 @@ from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.results.attributes import label
+from mitransient_lidar.studies.beam_spread import beam_spread, describe_spread
 from mitransient_lidar.transport.medium.water_phases import table_of
 from mitransient_lidar.transport.paths.passes import MOST_ORDERS, PathClasses
 from mitransient_lidar.transport.scene import LidarScene
@@ -52,15 +52,93 @@ _REVERSALS = ("one", "several")
 
 @checked
 @alone
-def scattering_orders(
+def scattering(
     scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
+    orders: Annotated[
+        int | None,
+        Option("Scattering orders to separate, 8 unless depths or views are given", 1, MOST_ORDERS),
+    ] = None,
+    depths: Annotated[
+        Numbers | None,
+        Option("Spread of the beam at depths below the mean sea level", 0, unit="m", above=True, form="N,N,..."),
+    ] = None,
+    fov_mrad: Annotated[
+        Numbers | None,
+        Option("Attenuation in fields of view, by full angles", 0, unit="mrad", above=True, form="N,N,..."),
+    ] = None,
     instrument: Instrument = None,
-    orders: Annotated[int, Option("Number of orders to separate", 1, MOST_ORDERS)] = 8,
-    passes: Annotated[int, Option("Number of independent passes per render", 2, 100_000)] = 32,
-    max_time: FewerPasses = None,
+    min_depth: Annotated[
+        float, Option("Depth where the attenuation of a view begins, below the surface echo", 0, unit="m")
+    ] = 1.0,
+    max_depth: Annotated[
+        float, positive_option("Depth where it ends, below --min-depth, above bottom and targets", "m")
+    ] = 5.0,
+    passes: Annotated[
+        int | None,
+        Option(
+            "Independent passes per render, by default 32 for orders, 8 for depths, and 48, at least 4, for views",
+            *(2, 100_000),
+        ),
+    ] = None,
+    photons: Annotated[int, Option("Photons per pass, for depths", 1024, 2**24)] = 2**16,
+    max_time: Annotated[
+        float | None,
+        positive_option("Stop before this many seconds, with fewer passes, or without the widest fields of view"),
+    ] = None,
     seed: Seed = 0,
+    integrator: Any = None,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Measure scattering: light by its order, spread of the beam with depth, or attenuation in several fields of view.
+
+    Parameters
+    ----------
+    scene, params, instrument
+        As for `rendering.render.render`.
+    orders, depths, fov_mrad
+        Alternatives; by default the light of 8 orders.
+
+    Returns
+    -------
+    xarray.Dataset
+        As from `scattering_orders`, `beam_spread.beam_spread` or `fov_sweep`.
+
+    Raises
+    ------
+    UserError
+        If the scene is invalid, a number is out of range, or as for these functions.
+    """
+    wanted = {"orders": orders, "depths": depths, "fov_mrad": fov_mrad}
+    named = [f"{name} = {shown(value)}" for name, value in wanted.items() if value is not None]
+    if len(named) > 1:
+        raise UserError(f"{' and '.join(named)} are alternatives: give one of them")
+    options: dict[str, Any] = {"instrument": instrument, "max_time": max_time, "seed": seed, "progress": progress}
+    if depths is not None:
+        return beam_spread(scene, params, depths=depths, passes=passes or 8, photons=photons, **options)
+    if fov_mrad is not None:
+        options |= {"passes": integer("passes", passes or 48, 4, 100_000)}
+        return fov_sweep(scene, params, fov_mrad=fov_mrad, min_depth=min_depth, max_depth=max_depth, **options)
+    return scattering_orders(scene, params, orders=orders or 8, passes=passes or 32, integrator=integrator, **options)
+
+
+def describe_scattering(found: xr.Dataset) -> list[str]:
+    """Return table lines for a result of `scattering`."""
+    if "depth" in found.dims:
+        return describe_spread(found)
+    return describe_fov_sweep(found) if "field_of_view" in found.dims else describe_orders(found)
+
+
+def scattering_orders(
+    scene: Any,
+    params: Mapping[str, Any] | None = None,
+    *,
+    instrument: str | None = None,
+    orders: int = 8,
+    passes: int = 32,
+    max_time: float | None = None,
+    seed: int = 0,
     integrator: Any = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
@@ -68,7 +146,7 @@ def scattering_orders(
 
     Light reflected only by the sea, the bottom or a target is of order 0. The vertical direction of every echo is
     reversed at least once, and three times or more by scattering, a second reflection, or reflection inside the
-    surface.
+    surface. Arguments as of `scattering`.
 
     Returns
     -------
@@ -145,39 +223,24 @@ def describe_orders(result: xr.Dataset) -> list[str]:
 logger = logging.getLogger(__name__)
 
 
-@checked
-@alone
 def fov_sweep(
-    scene: Scene,
+    scene: Any,
     params: Mapping[str, Any] | None = None,
     *,
-    fov_mrad: Annotated[
-        Numbers, Option("Full angles of the fields of view", 0, unit="mrad", above=True, form="N,N,...")
-    ] = (2, 5, 10, 20, 50, 100),
-    instrument: Instrument = None,
-    min_depth: Annotated[
-        float, Option("Depth where the slope of the signal begins, below the surface echo", 0, unit="m")
-    ] = 1.0,
-    max_depth: Annotated[
-        float, positive_option("Depth where it ends, below --min-depth, above bottom and targets", "m")
-    ] = 5.0,
-    passes: Annotated[int, Option("Number of independent passes per render", 4, 10_000)] = 48,
-    max_time: Annotated[
-        float | None,
-        positive_option("Stop before this many seconds, without the widest fields of view, but with the narrowest one"),
-    ] = None,
-    seed: Seed = 0,
+    fov_mrad: Numbers = (2, 5, 10, 20, 50, 100),
+    instrument: str | None = None,
+    min_depth: float = 1.0,
+    max_depth: float = 5.0,
+    passes: int = 48,
+    max_time: float | None = None,
+    seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Measure the column signal's attenuation as a function of the field of view.
 
-    Parameters
-    ----------
-    scene, params, instrument
-        As for `rendering.render.render`. One circle about the axis replaces the pixels. The largest circle replaces an
-        XML scene's parameter ``field_of_view_mrad``, which determines the size of the surface.
-    min_depth, max_depth
-        Limits of the fit [m], 0 <= `min_depth` < `max_depth`, in homogeneous water and far from bottom and targets.
+    One circle about the axis replaces the pixels. The largest circle replaces an XML scene's parameter
+    ``field_of_view_mrad``, which determines the size of the surface. The fit's limits `min_depth` and `max_depth` [m],
+    0 <= `min_depth` < `max_depth`, lie in homogeneous water and far from bottom and targets.
 
     Returns
     -------

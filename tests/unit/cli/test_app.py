@@ -100,9 +100,7 @@ def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path
     ("command", "describe", "plot"),
     [
         ("detect", "describe_detection", "targets:plot_detection"),
-        ("beam-spread", "describe_spread", "light:plot_beam_spread"),
-        ("fov-sweep", "describe_fov_sweep", "light:plot_fov_sweep"),
-        ("scattering-orders", "describe_orders", "light:plot_scattering_orders"),
+        ("scattering", "describe_scattering", "light:plot_scattering"),
     ],
 )
 def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, describe, plot, monkeypatch, tmp_path):
@@ -111,8 +109,7 @@ def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, descr
     stub(monkeypatch, command, lambda **_: xr.Dataset(attrs={"interrupted": 1, "passes": 3}))
     monkeypatch.setattr(f"mitransient_lidar.{study}.{describe}", lambda _: ["lines"])
     monkeypatch.setattr(f"mitransient_lidar.plots.studies.{plot.replace(':', '.')}", lambda *_: None)
-    depths = ["--depths", "3"] if command == "beam-spread" else []
-    done = run(command, "table1", *depths, "-o", tmp_path / "out.png", "-q")
+    done = run(command, "table1", "-o", tmp_path / "out.png", "-q")
     assert done.stdout.splitlines() == [str(tmp_path / "out.nc"), "lines"]
     assert (done.exit_code, done.stderr) == (130, "interrupted after 3 passes; their result is kept\n")
 

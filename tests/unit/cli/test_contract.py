@@ -18,7 +18,6 @@ from mitransient_lidar.results import files
 
 #: Arguments that commands need besides an option, the result RESULT included.
 NEEDED = {
-    "beam-spread": ["table1", "--depths", 2],
     "bounds": ["table1", "--free", "attenuation"],
     "campaign": ["runs.toml"],
     "depth-bias": ["riegl_vq840g"],

@@ -16,17 +16,15 @@ FLAT = ["-D", "spectrum=flat", "-D", "surface_size=60", "-D", "bin_width_ns=2", 
 WAVES = ["-D", "surface_size=60", "-D", "surface_cell_size=0.25", *FLAT[4:]]
 SEA_COMMANDS = ("find-shots",)
 #: Those that take most time.
-SLOW = {"detect", "beam-spread", "fov-sweep", "passive"}
-SLOW |= {"echoes", "frames", "scattering-orders", "bounds", "figures", "forecast"}
+SLOW = {"detect", "passive"}
+SLOW |= {"echoes", "frames", "scattering", "bounds", "figures", "forecast"}
 
 #: Arguments of each command, after the scene or the result if it takes one.
 SCENE_COMMANDS = {
     "find-shots": ["--no-waveforms"],
     "detect": ["--passes", 16, "--shots", 1000, "--renders", 3],
     "bounds": ["--free", "attenuation,bottom_reflectance", "--over", "layout=1x1,2x2", "--renders", 2, "--passes", 2],
-    "beam-spread": ["--depths", "2,5", "--passes", 2],
-    "fov-sweep": ["--fov-mrad", "20,35", "--passes", 8],
-    "scattering-orders": ["--passes", 2, "--orders", 2],
+    "scattering": ["--passes", 2, "--orders", 2],
 }
 RESULT_COMMANDS = {
     "view": ["--plot"],

@@ -63,9 +63,7 @@ CASES = {
     ),
     "forecast": figure("riegl_vq840g", "1:3", files=("png", "nc", "tif"), other=INSTRUMENT),
     "bounds": figure("table1", "--free", "bottom_depth", files=("png", "nc", "csv")),
-    "beam-spread": figure("table1", "--depths", "2"),
-    "fov-sweep": figure("table1"),
-    "scattering-orders": figure("table1"),
+    "scattering": figure("table1"),
     "scenes water": (["jerlov", "no_such_type", "-o", "d/f.png"], ["d/f.png"], {"kind": "petzold"}),
     "figures": (["fig09", "--target-error", "-1", "-o", "d"], ["d/fig09.png", "d/statements.csv"], None),
     "view": (["damaged.nc", "-o", "d/v.html", "--no-browser"], ["d/v.html"], OTHER),
@@ -221,23 +219,23 @@ def small_figures(monkeypatch):
 @pytest.mark.slow
 def test_line_names_what_differs(folder):
     few = ["--depths", 2, "--passes", 2, "-o", "d/a.png"]
-    first = ["beam-spread", "table1", *few]
+    first = ["scattering", "table1", *few]
     assert line(run(*first)) == []
     done = run(*first, "-D", "wind_speed=6", "--photons", 2048)
     assert line(done) == ["replaces d/a.nc and 1 more: wind_speed 3 -> 6, photons 65536 -> 2048"]
-    assert_refused(run("beam-spread", "fig09_2x2", *few), "since its scene is table1")
+    assert_refused(run("scattering", "fig09_2x2", *few), "since its scene is table1")
     mounted = [*first, "--instrument", "riegl_vq840g"]
     assert_refused(run(*mounted), "since its instrument is another one")
     drawn = run("view", "--plot", "d/a.nc")
-    assert_refused(drawn, "d/a.png is kept, since the command beam-spread has written it", "-o")
-    done = run("beam-spread", "fig09_2x2", *few, "--overwrite")
+    assert_refused(drawn, "d/a.png is kept, since the command scattering has written it", "-o")
+    done = run("scattering", "fig09_2x2", *few, "--overwrite")
     assert line(done) == ["replaces d/a.nc and 1 more: its scene is table1"]
     assert done.exit_code == 0
     # Files of one name in two folders are two scenes.
     for name in ("a", "b"):
         (folder / name).mkdir()
         run("scenes", "copy", "table1", f"{name}/lab.xml")
-    few = ["beam-spread", *few[:-1], "d/f.png"]
+    few = ["scattering", *few[:-1], "d/f.png"]
     assert run(*few, "a/lab.xml").exit_code == 0
     assert_refused(run(*few, "b/lab.xml"), "since its scene file is ../a/lab.xml")
     assert run(*few, folder / "a/lab.xml").exit_code == 0
@@ -262,15 +260,15 @@ def test_result_of_an_earlier_release_counts_by_its_attributes(folder):
 @pytest.mark.usefixtures("small_figures")
 def test_file_made_meanwhile_keeps_its_name(folder, monkeypatch):
     """The new one gets another, so that no render is lost."""
-    from mitransient_lidar.studies import beam_spread
+    from mitransient_lidar.studies import light_classes
 
     def slow(*arguments, **options):
         (folder / "d/f.nc").write_text("mine")
         return found(*arguments, **options)
 
-    found = beam_spread.beam_spread
-    stub(monkeypatch, "beam-spread", slow)
-    done = run("beam-spread", "table1", "--depths", 2, "--passes", 2, "-o", "d/f.png")
+    found = light_classes.scattering
+    stub(monkeypatch, "scattering", slow)
+    done = run("scattering", "table1", "--depths", 2, "--passes", 2, "-o", "d/f.png")
     assert done.exit_code == 0
     assert "d/f.nc is kept, since no command has written it as it is: the new file is d/f_2.nc." in done.stderr
     assert (folder / "d/f.nc").read_text() == "mine"
