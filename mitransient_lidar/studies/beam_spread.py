@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from typing import Any
 
 import mitsuba as mi
@@ -13,7 +12,7 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Numbers
 from mitransient_lidar.core.validation import ArrayLike, BoolArray, FloatArray
-from mitransient_lidar.loading.scenes import open_scene
+from mitransient_lidar.loading.scenes import LoadedScene
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes
 from mitransient_lidar.results.attributes import label
@@ -52,16 +51,7 @@ _COLUMN = 17
 
 
 def beam_spread(
-    scene: Any,
-    params: Mapping[str, Any] | None = None,
-    *,
-    depths: Numbers,
-    instrument: str | None = None,
-    passes: int = 8,
-    max_time: float | None = None,
-    photons: int = 2**16,
-    seed: int = 0,
-    progress: ProgressCallback | None = None,
+    session: LoadedScene, depths: Numbers, photons: int, goal: Goal, seed: int, progress: ProgressCallback | None
 ) -> xr.Dataset:
     """Trace light from the laser to horizontal planes under water, and measure its positions and delays.
 
@@ -94,7 +84,6 @@ def beam_spread(
     at 50 times the slant distance to the deepest plane, or at a weight below a millionth.
     """
     wanted = np.unique(depths)
-    session = open_scene(scene, params, instrument)
     lidar = find_lidar_scene(session.scene, session.sensor)
     lidar.transmitter.pose.require_above_sea()
     planes = _planes(lidar, wanted)
@@ -112,7 +101,7 @@ def beam_spread(
         measured.append([_measure(lidar, *pair, axes) for pair in zip(light, planes, strict=True)])
         return 0.0
 
-    log = run_passes(render_pass, Goal(passes=passes, max_time=max_time), seed=seed, progress=progress)
+    log = run_passes(render_pass, goal, seed=seed, progress=progress)
     missed = float(np.mean(outside))
     if missed > TOLERATED_LOSS:
         logger.warning(

@@ -114,13 +114,15 @@ def scattering(
     named = [f"{name} = {shown(value)}" for name, value in wanted.items() if value is not None]
     if len(named) > 1:
         raise UserError(f"{' and '.join(named)} are alternatives: give one of them")
-    options: dict[str, Any] = {"instrument": instrument, "max_time": max_time, "seed": seed, "progress": progress}
-    if depths is not None:
-        return beam_spread(scene, params, depths=depths, passes=passes or 8, photons=photons, **options)
     if fov_mrad is not None:
-        options |= {"passes": integer("passes", passes or 48, 4, 100_000)}
-        return fov_sweep(scene, params, fov_mrad=fov_mrad, min_depth=min_depth, max_depth=max_depth, **options)
-    return scattering_orders(scene, params, orders=orders or 8, passes=passes or 32, integrator=integrator, **options)
+        passes, params = integer("passes", passes or 48, 4, 100_000), _with_widest(scene, params, float(max(fov_mrad)))
+    session = open_scene(scene, params, instrument)
+    if depths is not None:
+        return beam_spread(session, depths, photons, Goal(passes=passes or 8, max_time=max_time), seed, progress)
+    goal = Goal(passes=passes or 32, max_time=max_time)
+    if fov_mrad is not None:
+        return fov_sweep(session, np.unique(fov_mrad), (min_depth, max_depth), goal, seed, progress)
+    return scattering_orders(session, orders or 8, goal, seed, integrator, progress)
 
 
 def describe_scattering(found: xr.Dataset) -> list[str]:
@@ -131,16 +133,7 @@ def describe_scattering(found: xr.Dataset) -> list[str]:
 
 
 def scattering_orders(
-    scene: Any,
-    params: Mapping[str, Any] | None = None,
-    *,
-    instrument: str | None = None,
-    orders: int = 8,
-    passes: int = 32,
-    max_time: float | None = None,
-    seed: int = 0,
-    integrator: Any = None,
-    progress: ProgressCallback | None = None,
+    session: LoadedScene, orders: int, goal: Goal, seed: int, integrator: Any, progress: ProgressCallback | None
 ) -> xr.Dataset:
     """Render a scene and separate its light by the number of scattering events in the water.
 
@@ -162,7 +155,6 @@ def scattering_orders(
     UserError
         If the scene or a parameter is invalid or out of range.
     """
-    session = open_scene(scene, params, instrument)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor, classes=PathClasses(orders))
     lidar = renderer.scene
@@ -179,7 +171,7 @@ def scattering_orders(
         power.add(waveform(histogram, axis.bin_width_ns, kernel))
         return record.edge_loss
 
-    log = run_passes(render_pass, Goal(passes=passes, max_time=max_time), seed=seed, progress=progress)
+    log = run_passes(render_pass, goal, seed=seed, progress=progress)
     warn_of_edge_loss(log.edge_loss_share(float(np.nansum(totals.mean)) * log.count))
     dims = ("pixel", "reversals", "order", "time")
     data = {
@@ -224,23 +216,18 @@ logger = logging.getLogger(__name__)
 
 
 def fov_sweep(
-    scene: Any,
-    params: Mapping[str, Any] | None = None,
-    *,
-    fov_mrad: Numbers = (2, 5, 10, 20, 50, 100),
-    instrument: str | None = None,
-    min_depth: float = 1.0,
-    max_depth: float = 5.0,
-    passes: int = 48,
-    max_time: float | None = None,
-    seed: int = 0,
-    progress: ProgressCallback | None = None,
+    session: LoadedScene,
+    fields: FloatArray,
+    limits: tuple[float, float],
+    goal: Goal,
+    seed: int,
+    progress: ProgressCallback | None,
 ) -> xr.Dataset:
     """Measure the column signal's attenuation as a function of the field of view.
 
     One circle about the axis replaces the pixels. The largest circle replaces an XML scene's parameter
-    ``field_of_view_mrad``, which determines the size of the surface. The fit's limits `min_depth` and `max_depth` [m],
-    0 <= `min_depth` < `max_depth`, lie in homogeneous water and far from bottom and targets.
+    ``field_of_view_mrad``, which determines the size of the surface. `fields` are full angles [mrad], increasing; the
+    fit's two `limits` [m] lie in homogeneous water and far from bottom and targets.
 
     Returns
     -------
@@ -250,7 +237,7 @@ def fov_sweep(
         axis where that meets the mean surface, ``scaled_radius`` c R_s [1], ``system_attenuation`` [1/m] by the fit in
         `system_attenuation`. Over ``field_of_view`` and ``time`` [ns]: ``impulse_response`` [J per bin] and its
         standard error. Attributes: ``attenuation`` c, ``absorption`` a, ``a_plus_bb``, ``kd`` [1/m] of the water,
-        ``beam_radius`` R_b [m], and ``left_out_mrad``, as text the fields of view that `max_time` or Ctrl-C has left
+        ``beam_radius`` R_b [m], and ``left_out_mrad``, as text the fields of view that time or Ctrl-C has left
         out.
 
     Raises
@@ -278,14 +265,14 @@ def fov_sweep(
     the noise. Errors in neighbouring circles are therefore correlated. They are jackknife estimates over the passes,
     which include the correlation between bins.
     """
-    fields = np.unique(fov_mrad)
-    session = open_scene(scene, _with_widest(scene, params, float(fields[-1])), instrument)
+    assert goal.passes is not None
+    (min_depth, max_depth), passes = limits, goal.passes
     lidar = find_lidar_scene(session.scene, session.sensor)
     geometry, edge = _geometry(lidar, 0.5e-3 * float(fields[-1]))
     column = ColumnBins.between(geometry, edge, lidar.axis, min_depth, max_depth)
-    water = _water(lidar, float(min_depth), float(max_depth))
-    _check_solids(lidar, geometry, edge, float(max_depth))
-    energy, log = _render(session, fields, Goal(passes=passes, max_time=max_time), seed, progress)
+    water = _water(lidar, min_depth, max_depth)
+    _check_solids(lidar, geometry, edge, max_depth)
+    energy, log = _render(session, fields, goal, seed, progress)
     left_out = ", ".join(f"{field:g}" for field in fields[len(energy) :])
     if left_out:
         logger.warning("fields of view of %s mrad are left out: their passes are not complete", left_out)
@@ -313,8 +300,8 @@ def fov_sweep(
         seed=seed,
         passes=passes,
         interrupted=int(log.interrupted),
-        min_depth=float(min_depth),
-        max_depth=float(max_depth),
+        min_depth=min_depth,
+        max_depth=max_depth,
         attenuation=water.attenuation,
         absorption=water.absorption,
         a_plus_bb=water.absorption + water.backscattering,
