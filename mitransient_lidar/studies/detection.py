@@ -41,7 +41,13 @@ from mitransient_lidar.physics.receiver.receiver_files import CAMERAS
 from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.studies.cases import Cases
-from mitransient_lidar.studies.target_signal import describe_target, find_target, signal_at, target_gates, target_signal
+from mitransient_lidar.studies.target_signal import (
+    describe_target,
+    find_target,
+    target_gates,
+    target_map,
+    target_signal,
+)
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
@@ -134,7 +140,7 @@ def detect(
         numbers x are filtered as sum(``filter_weight`` (x - ``background``)), which is 1 on average with the target,
         and with `frames` exceeds the attribute ``threshold`` by chance with the probability `pfa`.
 
-        Without a receiver: as from `target_signal.target_signal`.
+        Without a receiver: as from `target_signal.target_signal`, or `target_signal.target_map` with a grid.
 
     Raises
     ------
@@ -164,9 +170,12 @@ def detect(
     if isinstance(receiver, str) and receiver == "none":
         if len(depths) or clutter:
             raise UserError("receiver = 'none' measures the target's signal alone: leave out depths and clutter")
-        given: dict[str, Any] = {"instrument": instrument, "integrator": integrator, "progress": progress}
-        given |= {"target_id": target_id, "grid": grid, "max_offset": max_offset, "max_time": max_time, "seed": seed}
-        return target_signal(scene, params, passes=passes or 64, **given)
+        given: dict[str, Any] = {"target_id": target_id, "passes": passes or 64, "max_time": max_time, "seed": seed}
+        given |= {"integrator": integrator, "progress": progress}
+        if grid == 1:
+            return target_signal(open_scene(scene, params, instrument), is_lit=True, **given)
+        offsets = np.linspace(-max_offset, max_offset, grid).tolist()
+        return target_map(scene, params, offsets, offsets, instrument=instrument, **given)
     if grid > 1:
         raise UserError(f"grid = {grid} maps the target's signal alone: it needs receiver = 'none'")
     passes = passes or 16
@@ -214,8 +223,7 @@ def detect(
             if camera is not None:
                 one = target_gates(sea, **options)
             else:
-                # Deep targets may be lost.
-                one = (target_signal if place is None else signal_at)(sea, axis=axis, **options)
+                one = target_signal(sea, axis=axis, is_lit=place is None, **options)  # deep ones may be lost
             found.append(cases.keep(one))
             cases.step()
         first = first or found

@@ -253,8 +253,7 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
         coords = {"pixel": ["red", "green", "blue", "black"], "time": 0.5 + T}
         return xr.Dataset({name: (("pixel", "time"), values) for name, values in data.items()}, coords)
 
-    for name in ("target_signal", "signal_at"):
-        monkeypatch.setattr(detection, name, signal)
+    monkeypatch.setattr(detection, "target_signal", signal)
     done = []
     # Ten meshes are made, of which nothing is rendered.
     coarse = {"surface_size": 60, "surface_cell_size": 0.5}
