@@ -207,9 +207,8 @@ def forecast(
     Bottoms at depths of at most 1.25 times each other, 1.07 times where they get lost, lie under the same places of one
     sea. Their light is looked up in maps (`transport.light_maps.renderer`), or below the reach of these merged, and
     recorded and searched for echoes as in flights. Automatic gains are chosen as those of flights, for 128 pilot pulses
-    over the depths of the site. Depths go on until no bottom is
-    found, or to the deepest cell. Between waters, numbers are interpolated at the same product of depth and Kd, or
-    ratio of depth to Secchi depth.
+    over the depths of the site. Depths go on until no bottom is found, or to the deepest cell. Between waters, numbers
+    are interpolated at the same product of depth and Kd, or ratio of depth to Secchi depth.
     """
     laser = next(float(one.value) for one in read_instrument(instrument).parameters if one.name == "wavelength_nm")
     if not is_green(laser):
@@ -345,13 +344,9 @@ class _Bottoms:
         low, high = float(site.min()), further * float(site.max())
         top, deepest = low, min(high, _FIRST, max(self._reach, low))
         self._choose_settings(site, deepest)
-
-        def measure(depths: Sequence[float], sea: float) -> None:
-            for depth, recorded in self._recorded(depths, sea):
-                cells[depth] = _measured(recorded, corrections)
-
         while True:
-            measure([one for one in _nodes(top, deepest, _COARSE).tolist() if one not in cells], deepest)
+            nodes = [one for one in _nodes(top, deepest, _COARSE).tolist() if one not in cells]
+            cells |= self._measured(nodes, deepest, corrections)
             if deepest >= high or (cells and _found(cells[max(cells)]) < _NONE):
                 break
             top, deepest = deepest, min(high, _FURTHER * deepest)
@@ -362,20 +357,25 @@ class _Bottoms:
             first, last = _found(cells[above]), _found(cells[below])
             if first > _NONE and last < min(_ALL, first):
                 between = _nodes(above, below, _FINE)[1:-1].tolist()
-                measure(between, next(sea for sea in sorted([*self._sea, math.inf]) if sea >= below))
+                sea = next(sea for sea in sorted([*self._sea, math.inf]) if sea >= below)
+                cells |= self._measured(between, sea, corrections)
         return self._labelled(dict(sorted(cells.items())))
 
-    def _recorded(self, depths: Sequence[float], deepest: float) -> list[tuple[float, xr.Dataset]]:
-        """Return the records of bottoms at depths, in the sea of the deepest one of them [m]."""
-        found, near = [], [one for one in depths if one <= self._reach]
+    def _measured(
+        self, depths: Sequence[float], deepest: float, corrections: xr.Dataset | None
+    ) -> dict[float, dict[str, Any]]:
+        """Return the numbers of wet bottoms at depths, in the sea of the deepest one of them [m]."""
+        cells, near = {}, [one for one in depths if one <= self._reach]
         for some in ([near] if near else []) + [[one] for one in depths if one > self._reach]:
             series = self._by_maps(near, min(deepest, self._reach)) if some is near else self._merged(*some)
             series = series.isel(shot=np.isfinite(series["true_bottom_depth_below_surface"].values))
             recorded = detect_waveforms(series, self._receiver, self.records, self.seed, advice=False)
             self._attributes, self._pixels = dict(recorded.attrs), [str(one) for one in recorded["pixel"].values]
             of_depth = recorded["true_bottom_depth"].values
-            found += [(one, recorded.isel(shot=np.flatnonzero(np.isclose(of_depth, one)))) for one in some]
-        return [(depth, recorded) for depth, recorded in found if recorded.sizes["shot"]]
+            for depth in some:
+                if (own := np.flatnonzero(np.isclose(of_depth, depth))).size:
+                    cells[depth] = _numbers(recorded.isel(shot=own), corrections)
+        return cells
 
     def _choose_settings(self, depths: FloatArray, deepest: float) -> None:
         """Choose automatic gains and filters as flights do, by pilot shots over depths of the site [m].
@@ -438,7 +438,7 @@ class _Bottoms:
         return xr.Dataset(data, coords, {**self._attributes, **numbers, "instrument": self.instrument})
 
 
-def _measured(recorded: xr.Dataset, corrections: xr.Dataset | None) -> dict[str, Any]:
+def _numbers(recorded: xr.Dataset, corrections: xr.Dataset | None) -> dict[str, Any]:
     """Return numbers as of `depth_bias.depth_bias`, with bottoms alone that are right as found."""
     truth = recorded["true_bottom_depth_below_surface"].values
     echoes = extract(recorded, [_ESTIMATOR], targets=1)
@@ -471,9 +471,8 @@ def _row(table: xr.Dataset, name: str) -> FloatArray:
 def _deepest(depth: FloatArray, found: FloatArray) -> float:
     """Return the depth [m] where the share of found bottoms falls for good below the least, NaN if it never does."""
     seen = np.flatnonzero(found >= LEAST_FOUND)
-    if not seen.size or seen[-1] == depth.size - 1:
+    if not seen.size or (last := seen[-1]) == depth.size - 1:
         return math.nan
-    last = seen[-1]
     return float(np.interp(-LEAST_FOUND, -found[last : last + 2], depth[last : last + 2]))
 
 
@@ -481,23 +480,18 @@ def _maps(
     depth: FloatArray, water: FloatArray, deep: Any, waters: FloatArray, tables: Sequence[xr.Dataset], name: str
 ) -> dict[str, FloatArray]:
     """Return the numbers of tables in the cells of a site that are deep enough, and the deepest depths."""
-    maps = {key: np.full(depth.shape, np.nan) for key in ("found", "tvu", "thu", "deepest")}
-    d, w = depth[deep], water[deep]
-    place = np.interp(np.log(w), np.log(waters), np.arange(len(waters)))
-    totals = {key: np.zeros(d.shape) for key in maps}
+    maps = {key: np.where(deep, 0.0, np.nan) for key in ("found", "tvu", "thu", "deepest")}
+    place = np.interp(np.log(np.where(deep, water, 1)), np.log(waters), np.arange(len(waters)))
     for number, (one, table) in enumerate(zip(waters, tables, strict=True)):
         share = np.maximum(1 - np.abs(place - number), 0)
-        used = share > 0
+        used = deep & (share > 0)
+        d, w, share, nodes = depth[used], water[used], share[used], table["depth"].values
         ratio = {"kd": w / one, "secchi": one / w}.get(name, np.ones(w.shape))
-        nodes, found = table["depth"].values, _row(table, "found")
         for key in ("found", "tvu", "thu"):
-            row = _row(table, key)
-            known = np.isfinite(row)
+            known = np.isfinite(row := _row(table, key))
             values = np.interp(d * ratio, nodes[known], row[known]) if known.any() else np.full(d.shape, np.nan)
-            totals[key][used] += (share * values)[used]
-        totals["deepest"][used] += (share * _deepest(nodes, found) / ratio)[used]
-    for key, values in totals.items():
-        maps[key][deep] = values
+            maps[key][used] += share * values
+        maps["deepest"][used] += share * _deepest(nodes, _row(table, "found")) / ratio
     for key in ("tvu", "thu"):
         maps[key][~(maps["found"] >= LEAST_FOUND)] = np.nan
     order = order_met(depth, maps["tvu"], maps["thu"])
