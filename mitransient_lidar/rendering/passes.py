@@ -12,7 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.options import Option, declared, one_of, positive_option
+from mitransient_lidar.core.options import Option, declared, positive_option
 from mitransient_lidar.core.validation import FloatArray
 
 #: Largest number of passes allowed.
@@ -125,7 +125,6 @@ class RenderOptions:
             raise UserError(
                 f"target_quantile = {self.target_quantile:g} needs a target_error: the error that it must reach"
             )
-        one_of("light", self.light or LIGHT[0], LIGHT_OF_RENDERS)
         if self.derivatives and self.light in LIGHT_OF_RENDERS[1:]:
             raise UserError(f"light = {self.light!r} has no derivatives: use light = 'merging'")
         if self.smooth is not None and (self.components or self.derivatives or self.batches):

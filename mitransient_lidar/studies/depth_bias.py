@@ -388,7 +388,7 @@ def tpu(
     scene: SeaScene = "table1",
     receiver: OwnReceiver = None,
     infrared: Infrared = False,
-    estimator: Annotated[str, Option("Depth estimator, as for echoes")] = "gaussian",
+    estimator: Annotated[str, Option("Depth estimator, as for echoes", form="|".join(ESTIMATORS))] = "gaussian",
     shots: Places = 12,
     records: Records = 4,
     corrections: Annotated[
@@ -425,8 +425,6 @@ def tpu(
         If the instrument or estimator is unknown, or a number or parameter is out of range.
     """
     usual = {one.name: one.value for one in read_instrument(instrument).parameters}
-    if estimator not in ESTIMATORS:
-        raise UserError(f"estimator = {estimator!r} must be one of {', '.join(ESTIMATORS)}")
     given = dict(params or {})
     own = [finite("altitude", given.get("altitude", usual["altitude"]))]
     heights = np.asarray(own if altitudes is None else altitudes, float)

@@ -23,7 +23,6 @@ from mitransient_lidar.core.options import (
     SceneOrResult,
     Sensor,
     checked,
-    one_of,
     positive_option,
 )
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
@@ -37,7 +36,6 @@ from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import (
-    LIGHT,
     Components,
     LightOption,
     Progress,
@@ -203,7 +201,6 @@ def render_shots(
     options = RenderOptions(
         target_error=target_error, max_time=max_time, pass_share=pass_share, derivatives=differentiated, light=light
     )
-    one_of("light", light, LIGHT)
     wanted = options.target_error
     usual = (8, 1.0) if wanted is None else (MOST_PASSES_FOR_ERROR, share_for_error(wanted))
     if light == "maps":
