@@ -82,7 +82,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.fit import fit
     from mitransient_lidar.studies.forecast import forecast
-    from mitransient_lidar.studies.light_classes import estimate, fov_sweep, scattering_orders
+    from mitransient_lidar.studies.light_classes import scattering
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
@@ -96,12 +96,10 @@ _FUNCTIONS = {
     "depth_image": ("analysis.gates.range_images", "depth_image"),
     "detect": ("studies.detection", "detect"),
     "echoes": ("analysis.waveforms.echo_table", "extract"),
-    "estimate": ("studies.light_classes", "estimate"),
     "figures": ("plots.publication.figures", "figures"),
     "fit": ("studies.fit", "fit"),
     "fly": ("flights.fly", "fly"),
     "forecast": ("studies.forecast", "forecast"),
-    "fov_sweep": ("studies.light_classes", "fov_sweep"),
     "instrument_names": ("loading.catalogue", "instrument_names"),
     "kelvin_wake": ("physics.sea.kelvin_wake", "kelvin_wake"),
     "open_scene": ("loading.scenes", "open_scene"),
@@ -113,7 +111,7 @@ _FUNCTIONS = {
     "render_passive": ("rendering.passive", "render_passive"),
     "render_shots": ("rendering.shots.series", "render_shots"),
     "retrieve": ("analysis.retrieval.retrieve", "retrieve"),
-    "scattering_orders": ("studies.light_classes", "scattering_orders"),
+    "scattering": ("studies.light_classes", "scattering"),
     "scene_names": ("loading.catalogue", "scene_names"),
     "scene_parameters": ("loading.catalogue", "scene_parameters"),
     "tpu": ("studies.depth_bias", "tpu"),
@@ -125,7 +123,14 @@ _FUNCTIONS = {
 }
 
 #: Former names of functions, and those that have taken their place.
-_FORMER = {"depth_uncertainty": "tpu", "sweep": "campaign", "waveforms": "echoes"}
+_FORMER = {
+    "depth_uncertainty": "tpu",
+    "estimate": "render with light='level' and components=True",
+    "fov_sweep": "scattering with fov_mrad",
+    "scattering_orders": "scattering with orders",
+    "sweep": "campaign",
+    "waveforms": "echoes",
+}
 
 #: Without `open`, so that ``from mitransient_lidar import *`` leaves the one of Python alone.
 __all__ = [
@@ -140,12 +145,10 @@ __all__ = [
     "depth_image",
     "detect",
     "echoes",
-    "estimate",
     "figures",
     "fit",
     "fly",
     "forecast",
-    "fov_sweep",
     "instrument_names",
     "kelvin_wake",
     "open_scene",
@@ -158,7 +161,7 @@ __all__ = [
     "render_shots",
     "retrieve",
     "save",
-    "scattering_orders",
+    "scattering",
     "scene_names",
     "scene_parameters",
     "tpu",

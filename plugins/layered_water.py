@@ -47,7 +47,7 @@ class LayeredWater(mi.Medium):
 
     Give the coefficients, one of the six other water descriptions, or ``profile``; an empty text counts as not given. A
     description holds for all layers, or is a list with one value per layer: ``1C, 5C``. `physics.water.water_types`
-    states sources and uncertainties, and ``mitransient-lidar water`` prints the coefficients.
+    states sources and uncertainties, and ``mitransient-lidar scenes water`` prints the coefficients.
 
     At a ``wavelength_nm`` above 700, a named or default water absorbs like pure water (14.4 1/m at 1064 nm), and its
     particles scatter in proportion to 1/wavelength. Coefficients given as numbers stay unchanged, with a warning where

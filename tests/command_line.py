@@ -6,22 +6,28 @@ import functools
 
 import typer.testing
 
-from mitransient_lidar.cli.app import COMMANDS, app
+from mitransient_lidar.cli import app as command_line
+from mitransient_lidar.cli import scenes
+from mitransient_lidar.cli.app import app
 
 # Typer builds its command anew for every call, which takes longer than most commands of the tests.
 typer.testing._get_command = functools.cache(typer.testing._get_command)
 
+#: Rows of all commands, and what Typer makes of them, by their words.
+COMMANDS = {**command_line.COMMANDS, **{f"scenes {name}": row for name, row in scenes.SCENES.items()}}
 GROUP = typer.testing._get_command(app)
+MADE = {**GROUP.commands, **{f"scenes {name}": one for name, one in GROUP.commands["scenes"].commands.items()}}
 
 
 def run(*arguments):
-    """Return the result of a command, whose arguments may be of any type."""
-    return typer.testing.CliRunner().invoke(app, [str(argument) for argument in arguments])
+    """Return the result of a command, whose arguments may be of any type; the first one may be several words."""
+    words = [*str(arguments[0]).split(" "), *map(str, arguments[1:])] if arguments else []
+    return typer.testing.CliRunner().invoke(app, words)
 
 
 def stub(monkeypatch, command, function):
     """Replace the function that a command calls, and keep its options."""
-    GROUP.commands[command].params  # noqa: B018 (reads the signature)
+    MADE[command].params  # noqa: B018 (reads the signature)
     place, _, name = COMMANDS[command].function.partition(":")
     monkeypatch.setattr(f"mitransient_lidar.{place}.{name}", function)
 

@@ -14,7 +14,7 @@ import mitransient_lidar
 # refract light out of a narrow view as well.
 
 SCENE = {"divergence_mrad": 0.5, "bottom_depth": 12, "spectrum": "flat", "slope_variance": 2e-5}
-found = mitransient_lidar.fov_sweep("table1", SCENE, fov_mrad=[1, 5, 20, 80], passes=4, seed=1)
+found = mitransient_lidar.scattering("table1", SCENE, fov_mrad=[1, 5, 20, 80], passes=4, seed=1)
 
 # %%
 # K is half the power's decay along the path in the water.

@@ -13,7 +13,7 @@ import mitransient_lidar
 # Turbid water with c = 0.9 1/m and b = 0.7 1/m over a bottom at 6 m, in one 30 mrad pixel.
 
 WATER = {"attenuation": 0.9, "scattering": 0.7, "backscattering": 0.014, "bottom_depth": 6}
-found = mitransient_lidar.scattering_orders(
+found = mitransient_lidar.scattering(
     "table1", {**WATER, "layout": "1x1", "spectrum": "flat"}, orders=6, passes=4, seed=1
 )
 

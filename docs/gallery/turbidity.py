@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import mitransient_lidar
 
 # %%
-# ``jerlov`` stands for all coefficients of the water; ``mitransient-lidar water jerlov 1C`` prints them.
+# ``jerlov`` stands for all coefficients of the water; ``mitransient-lidar scenes water jerlov 1C`` prints them.
 
 options = {"passes": 8, "pass_share": 1 / 16, "seed": 1}
 shots = {

@@ -20,10 +20,10 @@ import numpy.typing as npt
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import is_there, read_text
 from mitransient_lidar.core.formats.documents import parse_toml, table
-from mitransient_lidar.core.options import BackgroundPower, Option, Plan, one_of, positive_option
+from mitransient_lidar.core.options import BackgroundPower, Option, Plan, positive_option
 from mitransient_lidar.core.validation import FloatArray, finite, is_number, shown
 from mitransient_lidar.physics.receiver.receiver_files import Setting
-from mitransient_lidar.rendering.passes import LIGHT, LightOption
+from mitransient_lidar.rendering.passes import LightOption
 
 _OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Add: operator.add,
@@ -225,7 +225,6 @@ class Campaign(Plan):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        one_of("light", self.light, LIGHT)
         if self.light == "maps" and self.derivatives:
             raise UserError("light = 'maps' has no derivatives: use light = 'merging'")
         if not self.keep:

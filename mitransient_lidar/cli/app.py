@@ -28,11 +28,17 @@ from mitransient_lidar.core.errors import UserError
 
 #: Former names of commands, and those that have taken their place.
 RENAMED = {
+    "beam-spread": "scattering --depths",
+    "fov-sweep": "scattering --fov-mrad",
+    "scattering-orders": "scattering --orders",
     "sweep": "campaign",
+    "target-signal": "detect --receiver none",
     "waveforms": "echoes",
+    "estimate": "render --light level --components",
     "plot": "view --plot",
     "shot-statistics": "shots --figure",
     "instruments": "scenes instruments",
+    "water": "scenes water",
 }
 
 #: All commands but ``scenes``, in the order of the help.
@@ -64,11 +70,11 @@ class _GroupedCommands(TyperGroup):
         with printable_streams():
             return super().main(*args, **kwargs)
 
-    commands_of, former = COMMANDS, RENAMED
+    commands_of, former, before = COMMANDS, RENAMED, ""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        made = {name: LazyCommand(name, row) for name, row in self.commands_of.items()}
+        made = {name: LazyCommand(name, row, self.before) for name, row in self.commands_of.items()}
         self.commands = {**made, **self.commands}
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
@@ -96,7 +102,7 @@ class _GroupedCommands(TyperGroup):
 class _SceneCommands(_GroupedCommands):
     """The scene commands."""
 
-    commands_of, former = scenes.SCENES, {}
+    commands_of, former, before = scenes.SCENES, {}, "scenes "
 
 
 @contextlib.contextmanager
@@ -208,7 +214,7 @@ def _common(
 
 @_scenes_app.callback(invoke_without_command=True)
 def _scenes(context: typer.Context) -> None:
-    """List, show or copy the shipped scenes, or list instruments."""
+    """List, show or copy the shipped scenes, list instruments, or print the properties of a water."""
     if context.invoked_subcommand is None:
         scenes.list_scenes()
 

@@ -256,10 +256,10 @@ def _decorated(name: str, run: Callable[..., None], listed: list[inspect.Paramet
 class LazyCommand(TyperCommand):
     """A command of a table, whose options are made when they are needed."""
 
-    def __init__(self, name: str, row: Command) -> None:
+    def __init__(self, name: str, row: Command, before: str = "") -> None:
         self._row, self._made = row, None  # type: tuple[Command, Any]
         text = inspect.cleandoc(row.body.__doc__ or "")
-        text += f"\n\nExample: mitransient-lidar {name} {row.example}" if row.example else ""
+        text += f"\n\nExample: mitransient-lidar {before}{name} {row.example}" if row.example else ""
         super().__init__(name, help=text, rich_help_panel=row.heading, rich_markup_mode=None)
 
     def _full(self) -> Any:

@@ -14,7 +14,7 @@ import typer
 
 from mitransient_lidar.core.errors import LINES, UserError, printable, raise_if_out_of_memory
 from mitransient_lidar.core.interruption import TerminationAsInterrupt
-from mitransient_lidar.core.tables.written import aligned_lines
+from mitransient_lidar.core.tables.written import aligned_lines, table_lines
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -249,7 +249,23 @@ def summarise(dataset: xr.Dataset) -> None:
             rows += [(printable(f"peak power, {name} (W)"), f"{peak:.4g}") for name, peak in named]
         else:
             rows.append(("highest peak power (W)", f"{float(peaks.max()):.4g}"))
-    typer.echo("\n".join(aligned_lines(rows)), err=True)
+    lines = aligned_lines(rows)
+    if "waveform_by_origin" in dataset:
+        lines += _by_origin(dataset)
+    typer.echo("\n".join(lines), err=True)
+
+
+def _by_origin(dataset: xr.Dataset) -> list[str]:
+    """Return the lines of a table: energy, and peak power with its time, of the light of each origin."""
+    columns = (("all pixels", "<12"), ("energy (J)", ">12.3e"), ("peak (W)", ">12.3e"), ("at (ns)", ">10.1f"))
+    rows = []
+    for one in dataset["origin"].values:
+        part = dataset.sel(origin=one)
+        received = float(part["impulse_response_by_origin"].sum())
+        power = part["waveform_by_origin"].sum([dim for dim in part["waveform_by_origin"].dims if dim != "time"])
+        peak = (float(power.max()), float(power.idxmax("time")))
+        rows.append((printable(str(one)), received, *(peak if received > 0 else ())))
+    return table_lines(columns, rows)
 
 
 def _console() -> Console:

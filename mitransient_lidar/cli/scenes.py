@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import check_targets, write_page
-from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, Quiet
+from mitransient_lidar.cli.files import announced, check_figure, check_targets, write_page
+from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, DrawingOnly, Quiet, function_at
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option
@@ -34,7 +34,7 @@ def list_scenes() -> None:
     _print((name, catalogue.scene_summary(name)) for name in catalogue.scene_names())
 
 
-@SCENES.add("Commands")
+@SCENES.add("Commands", example="table1 --html")
 def _show(
     name: Annotated[str, Option("Name of a shipped scene", form="NAME", is_argument=True)],
     html: Annotated[bool, Option("Write NAME.html, a page of the scene, instead")] = False,
@@ -52,7 +52,7 @@ def _show(
     typer.echo(scene_text(name), nl=False)
 
 
-@SCENES.add("Commands")
+@SCENES.add("Commands", example="table1 my_scene.xml")
 def _copy(
     name: Annotated[
         str, Option("Shipped scene, or file of a guide or flight, e.g. bottoms.toml", form="NAME", is_argument=True)
@@ -66,7 +66,7 @@ def _copy(
     typer.echo(catalogue.copy_scene(name, destination, overwrite))
 
 
-@SCENES.add("Commands")
+@SCENES.add("Commands", example="teledyne_czmil")
 def _instruments(
     name: Annotated[str | None, Option("Name of an instrument", form="NAME", is_argument=True)] = None,
     xml: Annotated[bool, Option("Print the XML of laser and receiver, to include in a scene")] = False,
@@ -91,6 +91,17 @@ def _instruments(
     typer.echo(f"{one.title}\n\n{one.description}\n\nchannels: {', '.join(one.channels)}\n")
     _print(((each.name, each.value, each.source) for each in one.parameters if each.value), right=(1,))
     typer.echo(f"\n{shipped.receiver_text(name)}", nl=False)
+
+
+@SCENES.add("Commands", "studies.water_report:describe_water", "jerlov 3C")
+def _water(call: Call, output: DrawingOnly = None) -> None:
+    """Print the optical properties of a water and its parameters."""
+    check_figure(output)
+    with announced():
+        lines = call()
+        if output is not None:
+            function_at("plots.water:plot_water")(**call.arguments, path=output)
+        typer.echo("\n".join(lines))
 
 
 @COMMANDS.add(_HEADING, "plots.publication.figures:figures", "fig09 fig13")

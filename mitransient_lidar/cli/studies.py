@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
-from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, DrawingOnly, Quiet, function_at
+from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, Quiet, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted
 from mitransient_lidar.core.options import Option
 
@@ -18,7 +18,7 @@ COMMANDS = Commands()
 Figure = Annotated[Path, Option("PNG, PDF or SVG file; also writes the data as .nc")]
 
 #: Headings of the help.
-_DESIGN, _LIGHT, _SURVEY = "Targets and designs", "Light in water", "Depths and their uncertainty"
+_DESIGN, _SURVEY = "Targets, designs and scattering", "Depths and their uncertainty"
 
 
 def _study(
@@ -73,37 +73,16 @@ _study(
 )
 _study(
     _DESIGN,
-    "studies.target_signal:target_signal",
-    "studies.targets:plot_target_signal",
-    "describe_target",
-    "fig13_2x2 --grid 5",
-    """Measure a target's signal in each pixel.
-
-    Renders the scene with and without the target on the same random numbers, and combines the pixels.
-    """,
-)
-_study(
-    _DESIGN,
     "studies.detection:detect",
     "studies.targets:plot_detection",
     "describe_detection",
     "fig13_2x2 --receiver pmt --depths 6,8,10",
     """Compute the detection probability of a target.
 
-    Compares one pixel, the sum and the best combination of pixels.
+    Compares one pixel, the sum and the best combination of pixels. With --receiver none it measures the target's
+    signal in each pixel: renders the scene with and without the target on the same random numbers.
     """,
     name="detection",
-)
-_study(
-    _LIGHT,
-    "studies.light_classes:estimate",
-    "waveforms:plot_components",
-    "describe_estimate",
-    "table1 --instrument riegl_vq840g",
-    """Estimate the waveforms in about a second, over a level sea.
-
-    Looks up the light in maps of the beam: a first look, and a second opinion on a render.
-    """,
 )
 _study(
     _DESIGN,
@@ -119,33 +98,16 @@ _study(
     table="write_table",
 )
 _study(
-    _LIGHT,
-    "studies.beam_spread:beam_spread",
-    "studies.light:plot_beam_spread",
-    "describe_spread",
-    "table1 --depths 2,4,8",
-    """Measure how the laser beam spreads with depth.
-
-    Horizontal spread, delays, and share of the light within the field of view.
-    """,
-)
-_study(
-    _LIGHT,
-    "studies.light_classes:fov_sweep",
-    "studies.light:plot_fov_sweep",
-    "describe_fov_sweep",
-    "table1 --fov-mrad 5,20,80",
-    "Measure the water's attenuation at several fields of view.",
-)
-_study(
-    _LIGHT,
-    "studies.light_classes:scattering_orders",
-    "studies.light:plot_scattering_orders",
-    "describe_orders",
+    _DESIGN,
+    "studies.light_classes:scattering",
+    "studies.light:plot_scattering",
+    "describe_scattering",
     "table1 --orders 4",
-    """Separate the received light by scattering order.
+    """Measure how the water scatters the light: by order, with depth, or against the field of view.
 
-    Each order is also separated by its vertical reversals: one, or several.
+    Separates the received light by scattering order, and each order by its vertical reversals: one, or several. With
+    --depths: the horizontal spread of the laser beam, its delays, and its share within the field of view. With
+    --fov-mrad: the water's attenuation at several fields of view.
     """,
 )
 _study(
@@ -163,17 +125,6 @@ _study(
     table="write_maps",
     table_suffix=".tif",
 )
-
-
-@COMMANDS.add(_LIGHT, "studies.water_report:describe_water", "jerlov 3C")
-def _water(call: Call, output: DrawingOnly = None) -> None:
-    """Print the optical properties of a water and its parameters."""
-    check_figure(output)
-    with announced():
-        lines = call()
-        if output is not None:
-            function_at("plots.water:plot_water")(**call.arguments, path=output)
-        typer.echo("\n".join(lines))
 
 
 @COMMANDS.add(_SURVEY, "studies.depth_bias:depth_bias", "riegl_vq840g --winds 0,3 --depths 3,6")

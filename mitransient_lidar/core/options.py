@@ -105,7 +105,7 @@ class Option:
     above: bool = False
     ascending: bool = False  #: Whether the numbers in a list must increase.
     #: Form of a text that stands for the value on the command line, e.g. ``N,N,...``; empty for types that are read as
-    #: they are.
+    #: they are. Words such as ``linear|log`` are the only ones allowed.
     form: str = ""
     flag: str = ""  #: Option name in commands, where it differs from the parameter's name.
     is_argument: bool = False  #: Whether commands take it by its place.
@@ -130,6 +130,8 @@ class Option:
     def check(self, name: str, value: Any, kind: Any) -> Any:
         """Return a typed value as a number or a list of numbers; raise `UserError` if it is out of range."""
         kinds = parts(kind)
+        if "|" in self.form and self.form.islower():
+            return one_of(name, value, self.form.split("|"))
         if self.low is None or (isinstance(value, str) and value == "auto" and "auto" in kinds):
             return value
         if (isinstance(value, (list, tuple, np.ndarray)) or not {int, float} & {*kinds}) and _is_list(kinds):
@@ -408,7 +410,7 @@ def _composed(name: str, value: Any, kind: Any, option: Option) -> Any:
         return table(name, value)
     if kind is str and not isinstance(value, str):
         raise UserError(f"{name} = {shown(value)} must be {option.form or 'a name'}")
-    return value
+    return option.check(name, value, kind)
 
 
 def _list(name: str, value: Any, kinds: tuple[Any, ...], option: Option) -> tuple[Any, ...]:

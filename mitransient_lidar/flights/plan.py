@@ -18,7 +18,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.formats.documents import parse_toml
 from mitransient_lidar.core.maps import MapSystem, map_system
-from mitransient_lidar.core.options import Option, Plan, one_of, positive_option
+from mitransient_lidar.core.options import Option, Plan, positive_option
 from mitransient_lidar.core.validation import FloatArray, shown
 from mitransient_lidar.flights.las_header import check_same_system
 from mitransient_lidar.flights.poses.mounting import Mounting, PulsePoses, pulse_poses
@@ -27,7 +27,7 @@ from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.refracted_paths import PoseErrors
 from mitransient_lidar.loading.catalogue import with_infrared
 from mitransient_lidar.physics.receiver.receiver_files import Setting
-from mitransient_lidar.rendering.passes import LIGHT, LightOption
+from mitransient_lidar.rendering.passes import LightOption
 from mitransient_lidar.results.attributes import PointClass
 
 #: Parameters of the scene that the poses of the pulses replace.
@@ -104,7 +104,7 @@ class FlightPlan(Plan):
     pulses: Annotated[Pulses, Option("Pulses")]
     receiver: Annotated[FlightReceiver, Option("Receiver")] = field(default_factory=FlightReceiver)
     errors: Annotated[PoseErrors, Option("Standard deviations of poses")] = field(default_factory=PoseErrors)
-    estimator: Annotated[str, Option("Estimator of echo_table.extract")] = "gaussian"
+    estimator: Annotated[str, Option("Estimator of echo_table.extract", form="|".join(ESTIMATORS))] = "gaussian"
     corrections: Annotated[
         str, Option("none, auto or a file, as of depth_correction.corrections_for", form="a name or a path")
     ] = "none"
@@ -134,8 +134,6 @@ class FlightPlan(Plan):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        one_of("estimator", self.estimator, ESTIMATORS)
-        one_of("light", self.light, LIGHT)
         if self.object_class not in OBJECT_CLASSES:
             allowed = ", ".join(map(str, OBJECT_CLASSES))
             raise UserError(f"object_class = {self.object_class} must be one of {allowed}")

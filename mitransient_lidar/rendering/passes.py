@@ -12,7 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.options import Option, declared, one_of, positive_option
+from mitransient_lidar.core.options import Option, declared, positive_option
 from mitransient_lidar.core.validation import FloatArray
 
 #: Largest number of passes allowed.
@@ -73,15 +73,21 @@ Smooth = Annotated[
         *(0.2, 20),
     ),
 ]
-#: Ways to compute the light.
+#: Ways to compute the light, of series and of a render.
 LIGHT = ("merging", "maps")
-_LIGHT = Option(
+LIGHT_OF_RENDERS = (*LIGHT, "level")
+_LIGHT = (
     "Computation of the light: merging (the default), or maps of the beam at several depths: several times faster, "
-    "within 1 %",
-    form="|".join(LIGHT),
+    "within 1 %"
 )
-LightOption = Annotated[str, _LIGHT]
-Light = Annotated[str | None, _LIGHT]
+LightOption = Annotated[str, Option(_LIGHT, form="|".join(LIGHT))]
+Light = Annotated[
+    str | None,
+    Option(
+        f"{_LIGHT}; level for a first look in about a second: maps below a level sea",
+        form="|".join(LIGHT_OF_RENDERS),
+    ),
+]
 Variant = Annotated[str | None, Option("Mitsuba variant, e.g. llvm_ad_mono")]
 
 #: Options that results keep, and the attributes that hold them.
@@ -119,9 +125,8 @@ class RenderOptions:
             raise UserError(
                 f"target_quantile = {self.target_quantile:g} needs a target_error: the error that it must reach"
             )
-        one_of("light", self.light or LIGHT[0], LIGHT)
-        if self.light == "maps" and self.derivatives:
-            raise UserError("light = 'maps' has no derivatives: use light = 'merging'")
+        if self.derivatives and self.light in LIGHT_OF_RENDERS[1:]:
+            raise UserError(f"light = {self.light!r} has no derivatives: use light = 'merging'")
         if self.smooth is not None and (self.components or self.derivatives or self.batches):
             raise UserError(
                 f"smooth = {self.smooth:g} keeps gates alone: leave out components, derivatives and batches"

@@ -23,6 +23,7 @@ from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_s
 from mitransient_lidar.rendering.pass_size import describe_cost, fit_to_time
 from mitransient_lidar.rendering.passes import (
     DEFAULT_MAX_MEMORY_GB,
+    SMALLEST_PASS_COUNT,
     TOLERATED_LOSS,
     Batches,
     Components,
@@ -139,7 +140,9 @@ def render(
     light
         'merging' (the default), the integrator, or 'maps': the light of the beam is looked up in maps at several depths
         (`transport.light_maps.renderer`). For images over waves, layers of one index and a bottom; shadows of targets
-        in the beam are left out.
+        in the beam are left out. 'level', by default 8 passes in about a second, is a first look and a second opinion:
+        such maps below a level sea with all of its slopes as ripples, the mean over seas. Light that turns more than
+        once between down and up is left out, as are the sides of solids.
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here. The previously
         active variant is active again afterwards.
@@ -232,8 +235,10 @@ def _render(
     if components:
         check_solids(sum(not shape.is_medium_transition() for shape in session.scene.shapes()))
     sensor, chosen = session.sensor, choose_integrator(session.scene, integrator)
-    if options.light == "maps":
-        renderer: PassRenderer = LightMapRenderer(find_lidar_scene(session.scene, sensor), PathClasses(), image=True)
+    by_maps, is_level = options.light in ("maps", "level"), options.light == "level"
+    if by_maps:
+        kind = {"image": not is_level, "level": is_level}
+        renderer: PassRenderer = LightMapRenderer(find_lidar_scene(session.scene, sensor), PathClasses(), **kind)
     else:
         renderer = chosen.prepare(session.scene, sensor)
     if components:
@@ -247,7 +252,7 @@ def _render(
         renderer = renderer.perturbed(changes)
     window = ErrorWindow.of_probe(renderer.probe)
     check_scene(renderer.probe)
-    if options.light == "maps":
+    if by_maps:
         warn_of_shadows(lidar)
     described = describe_scene(renderer.probe, window, renderer.focusing)
     origins = renderer.classes.names if components else []
@@ -256,7 +261,7 @@ def _render(
         lidar, window, surface, max_memory, origins, parameters, differences, options.batches or 0, options.smooth
     )
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
-
+    default = Goal(passes=SMALLEST_PASS_COUNT) if is_level else default
     goal = Goal.from_options(options.target_error, options.max_time, options.passes, default, options.target_quantile)
     full = renderer.for_smoothing(share_of_pass(options.smooth)) if options.smooth else renderer
     fitted = full if share == 1 else full.scaled(share)
@@ -305,7 +310,7 @@ def _render(
         **({"derivatives": [one.name for one in parameters]} if parameters else {}),
         **({"batches": options.batches} if options.batches else {}),
         **({"smooth_pixels": options.smooth} if options.smooth else {}),
-        **({"light": options.light} if options.light == "maps" else {}),
+        **({"light": options.light} if by_maps else {}),
         elapsed_s=log.elapsed_s,
         error_median=log.error_median,
         error_p95=log.error_p95,

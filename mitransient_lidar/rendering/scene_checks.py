@@ -79,7 +79,7 @@ def warn_of_shadows(scene: LidarScene) -> None:
     lit = [str(target.id()) for target in scene.targets if not light_faintly(scene, target, place, None)[0]]
     if lit:
         logger.warning(
-            "light = 'maps' leaves out the shadows of %s in the beam: targets are a few per cent too dark, and the "
+            "light maps leave out the shadows of %s in the beam: targets are a few per cent too dark, and the "
             "bottom beside them too bright",
             ", ".join(lit[:_MOST_NAMED]),
         )

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import FewerPasses, Instrument, Numbers, Option, Scene, Seed, checked
+from mitransient_lidar.core.options import Numbers
 from mitransient_lidar.core.validation import ArrayLike, BoolArray, FloatArray
-from mitransient_lidar.loading.scenes import open_scene
-from mitransient_lidar.loading.variants import alone
+from mitransient_lidar.loading.scenes import LoadedScene
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.rendering.passes import TOLERATED_LOSS, Goal, ProgressCallback, run_passes
 from mitransient_lidar.results.attributes import label
@@ -52,21 +50,12 @@ _COLUMNS = (
 _COLUMN = 17
 
 
-@checked
-@alone
 def beam_spread(
-    scene: Scene,
-    params: Mapping[str, Any] | None = None,
-    *,
-    depths: Annotated[Numbers, Option("Depths below the mean sea level", 0, unit="m", above=True, form="N,N,...")],
-    instrument: Instrument = None,
-    passes: Annotated[int, Option("Number of independent passes per render", 2, 10_000)] = 8,
-    max_time: FewerPasses = None,
-    photons: Annotated[int, Option("Photons per pass", 1024, 2**24)] = 2**16,
-    seed: Seed = 0,
-    progress: ProgressCallback | None = None,
+    session: LoadedScene, depths: Numbers, photons: int, goal: Goal, seed: int, progress: ProgressCallback | None
 ) -> xr.Dataset:
     """Trace light from the laser to horizontal planes under water, and measure its positions and delays.
+
+    Arguments as of `light_classes.scattering`.
 
     Returns
     -------
@@ -95,7 +84,6 @@ def beam_spread(
     at 50 times the slant distance to the deepest plane, or at a weight below a millionth.
     """
     wanted = np.unique(depths)
-    session = open_scene(scene, params, instrument)
     lidar = find_lidar_scene(session.scene, session.sensor)
     lidar.transmitter.pose.require_above_sea()
     planes = _planes(lidar, wanted)
@@ -113,7 +101,7 @@ def beam_spread(
         measured.append([_measure(lidar, *pair, axes) for pair in zip(light, planes, strict=True)])
         return 0.0
 
-    log = run_passes(render_pass, Goal(passes=passes, max_time=max_time), seed=seed, progress=progress)
+    log = run_passes(render_pass, goal, seed=seed, progress=progress)
     missed = float(np.mean(outside))
     if missed > TOLERATED_LOSS:
         logger.warning(

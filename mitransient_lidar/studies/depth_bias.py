@@ -288,13 +288,17 @@ def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Datas
         after = summarize_depths(correct_depths(found, corrections), truth)
         numbers |= {f"corrected_{name}": after[name] for name in ("bias", "spread", "z")}
     numbers["attenuation"] = usual_attenuation(found["attenuation"].values, found["attenuation_stderr"].values)
-    for name in ("slope_along", "slope_across"):
-        numbers[name] = float(np.sqrt(np.mean(recorded[f"true_{name}"].values ** 2)))
     depth = (recorded["time"] - recorded["surface_time"]) * recorded["depth_per_ns"]
     near = np.abs(depth - float(np.mean(truth))) < _NEAR
     largest = recorded["snr"].where(near).max("time").transpose("shot", "pixel")
     numbers["snr"] = largest.median("shot").values
-    return numbers | _shares(recorded, found, truth, largest.values > _BRIGHT)
+    return numbers | rms_slopes(recorded) | _shares(recorded, found, truth, largest.values > _BRIGHT)
+
+
+def rms_slopes(recorded: xr.Dataset) -> dict[str, float]:
+    """Return root mean squares of the mean slopes in the beam [1], along and across, by their names."""
+    names = ("slope_along", "slope_across")
+    return {name: float(np.sqrt(np.mean(recorded[f"true_{name}"].values ** 2))) for name in names}
 
 
 def _shares(recorded: xr.Dataset, found: xr.Dataset, truth: FloatArray, bright: BoolArray) -> dict[str, FloatArray]:
@@ -384,7 +388,7 @@ def tpu(
     scene: SeaScene = "table1",
     receiver: OwnReceiver = None,
     infrared: Infrared = False,
-    estimator: Annotated[str, Option("Depth estimator, as for echoes")] = "gaussian",
+    estimator: Annotated[str, Option("Depth estimator, as for echoes", form="|".join(ESTIMATORS))] = "gaussian",
     shots: Places = 12,
     records: Records = 4,
     corrections: Annotated[
@@ -421,8 +425,6 @@ def tpu(
         If the instrument or estimator is unknown, or a number or parameter is out of range.
     """
     usual = {one.name: one.value for one in read_instrument(instrument).parameters}
-    if estimator not in ESTIMATORS:
-        raise UserError(f"estimator = {estimator!r} must be one of {', '.join(ESTIMATORS)}")
     given = dict(params or {})
     own = [finite("altitude", given.get("altitude", usual["altitude"]))]
     heights = np.asarray(own if altitudes is None else altitudes, float)

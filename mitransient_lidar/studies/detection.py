@@ -41,7 +41,13 @@ from mitransient_lidar.physics.receiver.receiver_files import CAMERAS
 from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.studies.cases import Cases
-from mitransient_lidar.studies.target_signal import find_target, signal_at, target_gates, target_signal
+from mitransient_lidar.studies.target_signal import (
+    describe_target,
+    find_target,
+    target_gates,
+    target_map,
+    target_signal,
+)
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
@@ -61,7 +67,11 @@ def detect(
     params: Mapping[str, Any] | None = None,
     *,
     instrument: Instrument = None,
-    receiver: Annotated[ReceiverChain | Camera | str, Option(RECEIVERS_OR_CAMERAS)] = "apd",
+    receiver: Annotated[
+        ReceiverChain | Camera | str, Option(f"{RECEIVERS_OR_CAMERAS}. With none: the target's signal alone")
+    ] = "apd",
+    grid: Annotated[int, Option("Target positions along each axis, to map the signal without a receiver", 1, 15)] = 1,
+    max_offset: Annotated[float, positive_option("Largest offset of these positions along each axis", "m")] = 2.0,
     pfa: Annotated[float, Option("False alarm probability", 1e-12, 0.5)] = 1e-3,
     pd: Annotated[
         float, Option("Required probability of detection (above the probability of false alarm, below 1)")
@@ -79,12 +89,15 @@ def detect(
     target_id: TargetId = "target",
     background_power_w: BackgroundPower = 0.0,
     frames: Annotated[int, Option("Averaged camera frames per gate, of one sea", 1, 1_000_000)] = 1,
-    passes: Annotated[int, Option("Number of independent passes per render", 16, 100_000)] = 16,
+    passes: Annotated[
+        int | None,
+        Option("Number of independent passes per render, by default 16, without a receiver 64", 16, 100_000),
+    ] = None,
     max_time: Annotated[
         float | None,
         positive_option(
             "Begin no further depth of --depths after this many seconds, and leave it out; the scene's own depth is "
-            "always rendered"
+            "always rendered. Without a receiver, stop before them, with fewer passes, at least 16 per position"
         ),
     ] = None,
     seed: Seed = 0,
@@ -94,12 +107,12 @@ def detect(
     """Simulate target detection with one pixel, and with sums and the best weighting of pixels.
 
     With a camera as the receiver: simulate it in images of the scene's gates, with any number of pixels, also by the
-    target's shadow.
+    target's shadow. With ``none``: measure the signal in each pixel alone, or map it (`target_signal.target_signal`).
 
     Parameters
     ----------
     scene, params, instrument, integrator
-        As for `target_signal.target_signal`, with at most 16 pixels, or gates for a camera.
+        As for `rendering.render.render`, with at most 16 pixels, or gates for a camera.
     shots
         Random shots without and with the target, 100 to 100 000; with clutter rounded up to a multiple of it. A camera
         needs none.
@@ -127,6 +140,8 @@ def detect(
         numbers x are filtered as sum(``filter_weight`` (x - ``background``)), which is 1 on average with the target,
         and with `frames` exceeds the attribute ``threshold`` by chance with the probability `pfa`.
 
+        Without a receiver: as from `target_signal.target_signal`, or `target_signal.target_map` with a grid.
+
     Raises
     ------
     UserError
@@ -152,6 +167,18 @@ def detect(
     Each render is filtered with the weights from the others, so that render errors lower the probability and never
     raise it. The sum has the mean, variance and skewness of rare events (`statistics.Statistic`).
     """
+    if isinstance(receiver, str) and receiver == "none":
+        if len(depths) or clutter:
+            raise UserError("receiver = 'none' measures the target's signal alone: leave out depths and clutter")
+        given: dict[str, Any] = {"target_id": target_id, "passes": passes or 64, "max_time": max_time, "seed": seed}
+        given |= {"integrator": integrator, "progress": progress}
+        if grid == 1:
+            return target_signal(open_scene(scene, params, instrument), is_lit=True, **given)
+        offsets = np.linspace(-max_offset, max_offset, grid).tolist()
+        return target_map(scene, params, offsets, offsets, instrument=instrument, **given)
+    if grid > 1:
+        raise UserError(f"grid = {grid} maps the target's signal alone: it needs receiver = 'none'")
+    passes = passes or 16
     device = receiver_of("receiver", receiver)
     camera, chain = (device, None) if isinstance(device, Camera) else (None, device.default.chain)
     in_range("pd", pd, 1.01 * pfa, 1 - 1e-9)
@@ -168,10 +195,10 @@ def detect(
         raise UserError("clutter needs waves: spectrum = flat makes every sea the same")
     lidar = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor).scene
     lidar.transmitter.pose.require_above_sea()
-    if camera is None and (grid := lidar.receiver.pixels.grid) is not None:
+    if camera is None and (shape := lidar.receiver.pixels.grid) is not None:
         raise UserError(
             f"receiver = {shown(receiver)} records waveforms of at most 16 pixels, and the scene is an image of "
-            f"{grid[0]}x{grid[1]}: it needs gates and a camera ({', '.join(CAMERAS)}, or a TOML file)"
+            f"{shape[0]}x{shape[1]}: it needs gates and a camera ({', '.join(CAMERAS)}, or a TOML file)"
         )
     if lidar.receiver.optics.response_time_ns > 0 and chain is not None and chain.amplifier is not None:
         _LOG.warning("the scene has a response time, and the amplifier's bandwidth smooths its light again")
@@ -196,8 +223,7 @@ def detect(
             if camera is not None:
                 one = target_gates(sea, **options)
             else:
-                # Deep targets may be lost.
-                one = (target_signal if place is None else signal_at)(sea, axis=axis, **options)
+                one = target_signal(sea, axis=axis, is_lit=place is None, **options)  # deep ones may be lost
             found.append(cases.keep(one))
             cases.step()
         first = first or found
@@ -378,6 +404,8 @@ def describe_detection(found: xr.Dataset) -> list[str]:
 
     The tables show required levels, random shots, and depths if any.
     """
+    if "detection" not in found:
+        return describe_target(found)
     if "gate" in found.dims:
         return _describe_images(found)
     attributes = found.attrs

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar._version import __version__
+from mitransient_lidar._version import release
 from mitransient_lidar.analysis.depth_uncertainty import (
     LEAST_FOUND,
     SURVEY_ORDERS,
@@ -63,6 +63,7 @@ from mitransient_lidar.studies.depth_bias import (
     Records,
     SeaScene,
     SeaSeed,
+    rms_slopes,
 )
 from mitransient_lidar.transport.light_maps.renderer import reach_of_scattering
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -206,9 +207,8 @@ def forecast(
     Bottoms at depths of at most 1.25 times each other, 1.07 times where they get lost, lie under the same places of one
     sea. Their light is looked up in maps (`transport.light_maps.renderer`), or below the reach of these merged, and
     recorded and searched for echoes as in flights. Automatic gains are chosen as those of flights, for 128 pilot pulses
-    over the depths of the site. Depths go on until no bottom is
-    found, or to the deepest cell. Between waters, numbers are interpolated at the same product of depth and Kd, or
-    ratio of depth to Secchi depth.
+    over the depths of the site. Depths go on until no bottom is found, or to the deepest cell. Between waters, numbers
+    are interpolated at the same product of depth and Kd, or ratio of depth to Secchi depth.
     """
     laser = next(float(one.value) for one in read_instrument(instrument).parameters if one.name == "wavelength_nm")
     if not is_green(laser):
@@ -246,16 +246,12 @@ def forecast(
         maps[f"table_{key}"] = ("water", "node"), np.array(rows)
     if "depth" not in place.coords:
         maps["depth"] = dims, place.depth
-    attributes = {
-        **{key: tables[0].attrs[key] for key in ("instrument", "altitude", "off_nadir_deg", "wind_speed", "gain")},
+    of_table = ("instrument", "altitude", "off_nadir_deg", "wind_speed", "gain")
+    attributes = {key: tables[0].attrs[key] for key in of_table} | {
         **{"pointing_mrad": pointing_mrad, "position_m": position_m, "height_m": height_m, "seed": seed},
-        **{"title": f"Forecast of {instrument}", "source": f"mitransient-lidar {__version__}", "site": str(site)},
-        **{
-            "shots": shots,
-            "records": records,
-            "saturating_share": SATURATING,
-            "water": "" if given is None else f"{name} {given}",
-        },
+        **{"title": f"Forecast of {instrument}", "source": release(), "site": str(site)},
+        **{"shots": shots, "records": records, "saturating_share": SATURATING},
+        "water": "" if given is None else f"{name} {given}",
     }
     if place.terrain is not None and place.terrain.origin is not None:
         attributes["map_origin"] = place.terrain.origin
@@ -319,25 +315,24 @@ def _sentence(found: xr.Dataset) -> str:
     return f"{text}; beyond {low:.1f}{f' to {high:.1f}' if high - low > 0.1 else ''} m the bottom is lost"
 
 
+@dataclass
 class _Bottoms:
     """Bottoms under the same places of a sea, recorded and measured; parameters as of `forecast`."""
 
-    def __init__(
-        self,
-        instrument: str,
-        scene: str,
-        params: Mapping[str, Any],
-        receiver: str | None,
-        shots: int,
-        records: int,
-        seed: int,
-    ) -> None:
-        self._instrument, self._scene, self._params = instrument, scene, params
-        self._records, self._seed = records, seed
-        self._places = np.random.default_rng(seed).uniform(-_FARTHEST, _FARTHEST, (shots, 2))
-        session = open_scene(scene, params, instrument)
+    instrument: str
+    scene: str
+    params: Mapping[str, Any]
+    receiver: str | None
+    shots: int
+    records: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        self._places = np.random.default_rng(self.seed).uniform(-_FARTHEST, _FARTHEST, (self.shots, 2))
+        session = open_scene(self.scene, self.params, self.instrument)
         self._reach = reach_of_scattering(find_lidar_scene(session.scene, session.sensor))
-        self._receiver: ReceiverChannels = receiver_of_result(xr.Dataset(attrs={"instrument": instrument}), receiver)
+        own = xr.Dataset(attrs={"instrument": self.instrument})
+        self._receiver: ReceiverChannels = receiver_of_result(own, self.receiver)
         self._scenes: dict[tuple[float, str], ShotScene] = {}
         self._sea: dict[float, Any] = {}
         self._attributes: dict[str, Any] = {}
@@ -349,13 +344,9 @@ class _Bottoms:
         low, high = float(site.min()), further * float(site.max())
         top, deepest = low, min(high, _FIRST, max(self._reach, low))
         self._choose_settings(site, deepest)
-
-        def measure(depths: Sequence[float], sea: float) -> None:
-            for depth, recorded in self._recorded(depths, sea):
-                cells[depth] = _measured(recorded, corrections)
-
         while True:
-            measure([one for one in _nodes(top, deepest, _COARSE).tolist() if one not in cells], deepest)
+            nodes = [one for one in _nodes(top, deepest, _COARSE).tolist() if one not in cells]
+            cells |= self._measured(nodes, deepest, corrections)
             if deepest >= high or (cells and _found(cells[max(cells)]) < _NONE):
                 break
             top, deepest = deepest, min(high, _FURTHER * deepest)
@@ -366,20 +357,25 @@ class _Bottoms:
             first, last = _found(cells[above]), _found(cells[below])
             if first > _NONE and last < min(_ALL, first):
                 between = _nodes(above, below, _FINE)[1:-1].tolist()
-                measure(between, next(sea for sea in sorted([*self._sea, math.inf]) if sea >= below))
+                sea = next(sea for sea in sorted([*self._sea, math.inf]) if sea >= below)
+                cells |= self._measured(between, sea, corrections)
         return self._labelled(dict(sorted(cells.items())))
 
-    def _recorded(self, depths: Sequence[float], deepest: float) -> list[tuple[float, xr.Dataset]]:
-        """Return the records of bottoms at depths, in the sea of the deepest one of them [m]."""
-        found, near = [], [one for one in depths if one <= self._reach]
+    def _measured(
+        self, depths: Sequence[float], deepest: float, corrections: xr.Dataset | None
+    ) -> dict[float, dict[str, Any]]:
+        """Return the numbers of wet bottoms at depths, in the sea of the deepest one of them [m]."""
+        cells, near = {}, [one for one in depths if one <= self._reach]
         for some in ([near] if near else []) + [[one] for one in depths if one > self._reach]:
             series = self._by_maps(near, min(deepest, self._reach)) if some is near else self._merged(*some)
             series = series.isel(shot=np.isfinite(series["true_bottom_depth_below_surface"].values))
-            recorded = detect_waveforms(series, self._receiver, self._records, self._seed, advice=False)
+            recorded = detect_waveforms(series, self._receiver, self.records, self.seed, advice=False)
             self._attributes, self._pixels = dict(recorded.attrs), [str(one) for one in recorded["pixel"].values]
             of_depth = recorded["true_bottom_depth"].values
-            found += [(one, recorded.isel(shot=np.flatnonzero(np.isclose(of_depth, one)))) for one in some]
-        return [(depth, recorded) for depth, recorded in found if recorded.sizes["shot"]]
+            for depth in some:
+                if (own := np.flatnonzero(np.isclose(of_depth, depth))).size:
+                    cells[depth] = _numbers(recorded.isel(shot=own), corrections)
+        return cells
 
     def _choose_settings(self, depths: FloatArray, deepest: float) -> None:
         """Choose automatic gains and filters as flights do, by pilot shots over depths of the site [m].
@@ -390,15 +386,15 @@ class _Bottoms:
         by_maps = bool(lying[0] <= self._reach)
         bottom = min(deepest, self._reach) if by_maps else float(lying[0])
         loaded = self._scene_of(bottom, "maps" if by_maps else "merging")
-        pilots = pilots_over(loaded, np.minimum(lying, bottom), bottom, self._seed * 2**20)
+        pilots = pilots_over(loaded, np.minimum(lying, bottom), bottom, self.seed * 2**20)
         self._receiver = self._receiver.with_channel_settings(shared_settings(pilots, self._receiver))
 
     def _scene_of(self, bottom: float, light: str) -> ShotScene:
         """Return the scene with a bottom at a depth [m]."""
         if (bottom, light) not in self._scenes:
-            params = {**self._params, "bottom_depth": bottom}
-            options: dict[str, Any] = {"instrument": self._instrument, "light": light, "check": not self._scenes}
-            self._scenes[bottom, light] = ShotScene(self._scene, params, self._places, **options)
+            params = {**self.params, "bottom_depth": bottom}
+            options: dict[str, Any] = {"instrument": self.instrument, "light": light, "check": not self._scenes}
+            self._scenes[bottom, light] = ShotScene(self.scene, params, self._places, **options)
         return self._scenes[bottom, light]
 
     def _by_maps(self, depths: Sequence[float], deepest: float) -> xr.Dataset:
@@ -414,18 +410,18 @@ class _Bottoms:
         known = {name: np.repeat(values, count) for name, (_, values, _) in truth.items()}
         below = lying + known["true_surface_height"]
         known |= {"true_bottom_depth": lying, "true_bottom_depth_below_surface": np.where(below > 0, below, np.nan)}
-        series = rendered(loaded, batches, poses, self._seed * 2**20)
+        series = rendered(loaded, batches, poses, self.seed * 2**20)
         return series.assign_coords({name: ("shot", values) for name, values in known.items()})
 
     def _merged(self, depth: float) -> xr.Dataset:
         """Return the light of a bottom at a depth [m], merged."""
         return render_shots(
-            self._scene,
-            {**self._params, "bottom_depth": depth},
+            self.scene,
+            {**self.params, "bottom_depth": depth},
             positions=self._places,
-            instrument=self._instrument,
+            instrument=self.instrument,
             target_error=_ERROR,
-            first_seed=self._seed * 2**20,
+            first_seed=self.seed * 2**20,
             describe_sea=False,
         )
 
@@ -439,10 +435,10 @@ class _Bottoms:
         numbers = {"off_nadir_deg": float(self._attributes["off_nadir_deg"]), "wind_speed": wind}
         coords: dict[str, Any] = {key: [value] for key, value in numbers.items()}
         coords |= {"water": [0], "depth": list(cells), "estimator": [_ESTIMATOR], "pixel": self._pixels}
-        return xr.Dataset(data, coords, {**self._attributes, **numbers, "instrument": self._instrument})
+        return xr.Dataset(data, coords, {**self._attributes, **numbers, "instrument": self.instrument})
 
 
-def _measured(recorded: xr.Dataset, corrections: xr.Dataset | None) -> dict[str, Any]:
+def _numbers(recorded: xr.Dataset, corrections: xr.Dataset | None) -> dict[str, Any]:
     """Return numbers as of `depth_bias.depth_bias`, with bottoms alone that are right as found."""
     truth = recorded["true_bottom_depth_below_surface"].values
     echoes = extract(recorded, [_ESTIMATOR], targets=1)
@@ -452,8 +448,7 @@ def _measured(recorded: xr.Dataset, corrections: xr.Dataset | None) -> dict[str,
     bottom = echoes.sel(echo="bottom").transpose("shot", "pixel", "estimator")
     right = np.abs(bottom["depth_m"].values - truth[:, np.newaxis, np.newaxis]) < _RIGHT
     numbers["found"] = np.mean(right & has_echo(bottom["flags"].values), axis=0).T
-    slopes = {name: recorded[f"true_{name}"].values for name in ("slope_along", "slope_across")}
-    return numbers | {name: float(np.sqrt(np.mean(values**2))) for name, values in slopes.items()}
+    return numbers | rms_slopes(recorded)
 
 
 def _found(cell: Mapping[str, Any]) -> float:
@@ -476,9 +471,8 @@ def _row(table: xr.Dataset, name: str) -> FloatArray:
 def _deepest(depth: FloatArray, found: FloatArray) -> float:
     """Return the depth [m] where the share of found bottoms falls for good below the least, NaN if it never does."""
     seen = np.flatnonzero(found >= LEAST_FOUND)
-    if not seen.size or seen[-1] == depth.size - 1:
+    if not seen.size or (last := seen[-1]) == depth.size - 1:
         return math.nan
-    last = seen[-1]
     return float(np.interp(-LEAST_FOUND, -found[last : last + 2], depth[last : last + 2]))
 
 
@@ -486,23 +480,18 @@ def _maps(
     depth: FloatArray, water: FloatArray, deep: Any, waters: FloatArray, tables: Sequence[xr.Dataset], name: str
 ) -> dict[str, FloatArray]:
     """Return the numbers of tables in the cells of a site that are deep enough, and the deepest depths."""
-    maps = {key: np.full(depth.shape, np.nan) for key in ("found", "tvu", "thu", "deepest")}
-    d, w = depth[deep], water[deep]
-    place = np.interp(np.log(w), np.log(waters), np.arange(len(waters))) if len(waters) > 1 else np.zeros(w.shape)
-    totals = {key: np.zeros(d.shape) for key in maps}
+    maps = {key: np.where(deep, 0.0, np.nan) for key in ("found", "tvu", "thu", "deepest")}
+    place = np.interp(np.log(np.where(deep, water, 1)), np.log(waters), np.arange(len(waters)))
     for number, (one, table) in enumerate(zip(waters, tables, strict=True)):
         share = np.maximum(1 - np.abs(place - number), 0)
-        used = share > 0
+        used = deep & (share > 0)
+        d, w, share, nodes = depth[used], water[used], share[used], table["depth"].values
         ratio = {"kd": w / one, "secchi": one / w}.get(name, np.ones(w.shape))
-        nodes, found = table["depth"].values, _row(table, "found")
         for key in ("found", "tvu", "thu"):
-            row = _row(table, key)
-            known = np.isfinite(row)
+            known = np.isfinite(row := _row(table, key))
             values = np.interp(d * ratio, nodes[known], row[known]) if known.any() else np.full(d.shape, np.nan)
-            totals[key][used] += (share * values)[used]
-        totals["deepest"][used] += (share * _deepest(nodes, found) / ratio)[used]
-    for key, values in totals.items():
-        maps[key][deep] = values
+            maps[key][used] += share * values
+        maps["deepest"][used] += share * _deepest(nodes, _row(table, "found")) / ratio
     for key in ("tvu", "thu"):
         maps[key][~(maps["found"] >= LEAST_FOUND)] = np.nan
     order = order_met(depth, maps["tvu"], maps["thu"])

@@ -1,4 +1,4 @@
-"""Parts of the received light: by scattering order, in a quick estimate, and in several fields of view."""
+"""Scattered light: by scattering order, in several fields of view, and as the spread of the beam."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.retrieval.column_retrieval import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import (
-    FewerPasses,
     Instrument,
     Numbers,
     Option,
@@ -26,7 +25,7 @@ from mitransient_lidar.core.options import (
     positive_option,
 )
 from mitransient_lidar.core.tables.written import table_lines
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, integer, shown
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.document import read_document
 from mitransient_lidar.loading.parameters import plugins_of
@@ -36,12 +35,10 @@ from mitransient_lidar.physics.lidar.axis_limits import system_attenuation
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.water.water_types import InherentProperties
-from mitransient_lidar.rendering.accumulators import PassAccumulator
-from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
-from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
+from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes, warn_of_edge_loss
 from mitransient_lidar.results.attributes import label
-from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
+from mitransient_lidar.studies.beam_spread import beam_spread, describe_spread
 from mitransient_lidar.transport.medium.water_phases import table_of
 from mitransient_lidar.transport.paths.passes import MOST_ORDERS, PathClasses
 from mitransient_lidar.transport.scene import LidarScene
@@ -50,92 +47,99 @@ from mitransient_lidar.transport.sensor.fov_shapes import Sector
 from mitransient_lidar.transport.sensor.pixels import ShapedPixels
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
-#: Independent passes, for standard errors.
-_PASSES = 8
-
-#: Largest number of paths.
-_MOST_PATHS = 2**22
-
-
-@checked
-@alone
-def estimate(
-    scene: Scene,
-    params: Mapping[str, Any] | None = None,
-    *,
-    instrument: Instrument = None,
-    paths: Annotated[int, Option("Number of paths of the light", 64, _MOST_PATHS)] = 2**13,
-    seed: Seed = 0,
-) -> xr.Dataset:
-    """Estimate the waveforms of a scene in about a second, as a first look and a second opinion.
-
-    Returns
-    -------
-    xarray.Dataset
-        As of `rendering.render.render` with ``components``.
-
-    Raises
-    ------
-    UserError
-        If the scene is invalid, or not one that light maps are for (`transport.light_maps.renderer.unsuited`); if a
-        number is out of range.
-
-    Notes
-    -----
-    Light is looked up in maps of the beam (`transport.light_maps.renderer`). The sea is level, with all of its slopes
-    as ripples, so that the result is a mean over seas, enhanced by the focusing of all waves
-    (`physics.sea.double_passage`). Light that turns more than once between down and up is missing, as are the sides
-    and shadows of solids.
-    """
-    session = open_scene(scene, params, instrument=instrument)
-    lidar = find_lidar_scene(session.scene, session.sensor)
-    renderer = LightMapRenderer(lidar, PathClasses(), level=True).by_origin()
-    session.tell_axis(lidar.axis, lidar.record_end)
-    window = ErrorWindow.of_probe(renderer.probe)
-    accumulator = PassAccumulator(lidar, window, origins=renderer.classes.names)
-    for number in np.random.SeedSequence(seed).generate_state(_PASSES):
-        accumulator.add(renderer.render_pass(int(number), paths=paths // _PASSES).histogram)
-    accumulator.require_light(_PASSES)
-    described = describe_scene(renderer.probe, window, renderer.focusing)
-    attributes = session.attributes(lidar, model="estimate", paths=paths, seed=seed, **described)
-    return with_lines_of_sight(accumulator.dataset(attributes), lidar)
-
-
-def describe_estimate(found: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a result of `estimate`: energy, and peak power with its time, by origin."""
-    energy, power = found["impulse_response_by_origin"], found["waveform_by_origin"]
-    over = [dim for dim in power.dims if dim not in ("origin", "time")]
-    columns = (("all pixels", "<12"), ("energy (J)", ">12.3e"), ("peak (W)", ">12.3e"), ("at (ns)", ">10.1f"))
-    rows = []
-    for name in found["origin"].values:
-        received, curve = float(energy.sel(origin=name).sum()), power.sel(origin=name).sum(over)
-        peak = (float(curve.max()), float(curve["time"][int(np.argmax(curve.values))]))
-        rows.append((str(name), received, *(peak if received > 0 else ())))
-    return table_lines(columns, rows)
-
-
 _REVERSALS = ("one", "several")
 
 
 @checked
 @alone
-def scattering_orders(
+def scattering(
     scene: Scene,
     params: Mapping[str, Any] | None = None,
     *,
+    orders: Annotated[
+        int | None,
+        Option("Scattering orders to separate, 8 unless depths or views are given", 1, MOST_ORDERS),
+    ] = None,
+    depths: Annotated[
+        Numbers | None,
+        Option("Spread of the beam at depths below the mean sea level", 0, unit="m", above=True, form="N,N,..."),
+    ] = None,
+    fov_mrad: Annotated[
+        Numbers | None,
+        Option("Attenuation in fields of view, by full angles", 0, unit="mrad", above=True, form="N,N,..."),
+    ] = None,
     instrument: Instrument = None,
-    orders: Annotated[int, Option("Number of orders to separate", 1, MOST_ORDERS)] = 8,
-    passes: Annotated[int, Option("Number of independent passes per render", 2, 100_000)] = 32,
-    max_time: FewerPasses = None,
+    min_depth: Annotated[
+        float, Option("Depth where the attenuation of a view begins, below the surface echo", 0, unit="m")
+    ] = 1.0,
+    max_depth: Annotated[
+        float, positive_option("Depth where it ends, below --min-depth, above bottom and targets", "m")
+    ] = 5.0,
+    passes: Annotated[
+        int | None,
+        Option(
+            "Independent passes per render, by default 32 for orders, 8 for depths, and 48, at least 4, for views",
+            *(2, 100_000),
+        ),
+    ] = None,
+    photons: Annotated[int, Option("Photons per pass, for depths", 1024, 2**24)] = 2**16,
+    max_time: Annotated[
+        float | None,
+        positive_option("Stop before this many seconds, with fewer passes, or without the widest fields of view"),
+    ] = None,
     seed: Seed = 0,
     integrator: Any = None,
     progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Measure scattering: light by its order, spread of the beam with depth, or attenuation in several fields of view.
+
+    Parameters
+    ----------
+    scene, params, instrument
+        As for `rendering.render.render`.
+    orders, depths, fov_mrad
+        Alternatives; by default the light of 8 orders.
+
+    Returns
+    -------
+    xarray.Dataset
+        As from `scattering_orders`, `beam_spread.beam_spread` or `fov_sweep`.
+
+    Raises
+    ------
+    UserError
+        If the scene is invalid, a number is out of range, or as for these functions.
+    """
+    wanted = {"orders": orders, "depths": depths, "fov_mrad": fov_mrad}
+    named = [f"{name} = {shown(value)}" for name, value in wanted.items() if value is not None]
+    if len(named) > 1:
+        raise UserError(f"{' and '.join(named)} are alternatives: give one of them")
+    if fov_mrad is not None:
+        passes, params = integer("passes", passes or 48, 4, 100_000), _with_widest(scene, params, float(max(fov_mrad)))
+    session = open_scene(scene, params, instrument)
+    if depths is not None:
+        return beam_spread(session, depths, photons, Goal(passes=passes or 8, max_time=max_time), seed, progress)
+    goal = Goal(passes=passes or 32, max_time=max_time)
+    if fov_mrad is not None:
+        return fov_sweep(session, np.unique(fov_mrad), (min_depth, max_depth), goal, seed, progress)
+    return scattering_orders(session, orders or 8, goal, seed, integrator, progress)
+
+
+def describe_scattering(found: xr.Dataset) -> list[str]:
+    """Return table lines for a result of `scattering`."""
+    if "depth" in found.dims:
+        return describe_spread(found)
+    return describe_fov_sweep(found) if "field_of_view" in found.dims else describe_orders(found)
+
+
+def scattering_orders(
+    session: LoadedScene, orders: int, goal: Goal, seed: int, integrator: Any, progress: ProgressCallback | None
 ) -> xr.Dataset:
     """Render a scene and separate its light by the number of scattering events in the water.
 
     Light reflected only by the sea, the bottom or a target is of order 0. The vertical direction of every echo is
     reversed at least once, and three times or more by scattering, a second reflection, or reflection inside the
-    surface.
+    surface. Arguments as of `scattering`.
 
     Returns
     -------
@@ -151,7 +155,6 @@ def scattering_orders(
     UserError
         If the scene or a parameter is invalid or out of range.
     """
-    session = open_scene(scene, params, instrument)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor, classes=PathClasses(orders))
     lidar = renderer.scene
@@ -168,7 +171,7 @@ def scattering_orders(
         power.add(waveform(histogram, axis.bin_width_ns, kernel))
         return record.edge_loss
 
-    log = run_passes(render_pass, Goal(passes=passes, max_time=max_time), seed=seed, progress=progress)
+    log = run_passes(render_pass, goal, seed=seed, progress=progress)
     warn_of_edge_loss(log.edge_loss_share(float(np.nansum(totals.mean)) * log.count))
     dims = ("pixel", "reversals", "order", "time")
     data = {
@@ -212,39 +215,19 @@ def describe_orders(result: xr.Dataset) -> list[str]:
 logger = logging.getLogger(__name__)
 
 
-@checked
-@alone
 def fov_sweep(
-    scene: Scene,
-    params: Mapping[str, Any] | None = None,
-    *,
-    fov_mrad: Annotated[
-        Numbers, Option("Full angles of the fields of view", 0, unit="mrad", above=True, form="N,N,...")
-    ] = (2, 5, 10, 20, 50, 100),
-    instrument: Instrument = None,
-    min_depth: Annotated[
-        float, Option("Depth where the slope of the signal begins, below the surface echo", 0, unit="m")
-    ] = 1.0,
-    max_depth: Annotated[
-        float, positive_option("Depth where it ends, below --min-depth, above bottom and targets", "m")
-    ] = 5.0,
-    passes: Annotated[int, Option("Number of independent passes per render", 4, 10_000)] = 48,
-    max_time: Annotated[
-        float | None,
-        positive_option("Stop before this many seconds, without the widest fields of view, but with the narrowest one"),
-    ] = None,
-    seed: Seed = 0,
-    progress: ProgressCallback | None = None,
+    session: LoadedScene,
+    fields: FloatArray,
+    limits: tuple[float, float],
+    goal: Goal,
+    seed: int,
+    progress: ProgressCallback | None,
 ) -> xr.Dataset:
     """Measure the column signal's attenuation as a function of the field of view.
 
-    Parameters
-    ----------
-    scene, params, instrument
-        As for `rendering.render.render`. One circle about the axis replaces the pixels. The largest circle replaces an
-        XML scene's parameter ``field_of_view_mrad``, which determines the size of the surface.
-    min_depth, max_depth
-        Limits of the fit [m], 0 <= `min_depth` < `max_depth`, in homogeneous water and far from bottom and targets.
+    One circle about the axis replaces the pixels. The largest circle replaces an XML scene's parameter
+    ``field_of_view_mrad``, which determines the size of the surface. `fields` are full angles [mrad], increasing; the
+    fit's two `limits` [m] lie in homogeneous water and far from bottom and targets.
 
     Returns
     -------
@@ -254,7 +237,7 @@ def fov_sweep(
         axis where that meets the mean surface, ``scaled_radius`` c R_s [1], ``system_attenuation`` [1/m] by the fit in
         `system_attenuation`. Over ``field_of_view`` and ``time`` [ns]: ``impulse_response`` [J per bin] and its
         standard error. Attributes: ``attenuation`` c, ``absorption`` a, ``a_plus_bb``, ``kd`` [1/m] of the water,
-        ``beam_radius`` R_b [m], and ``left_out_mrad``, as text the fields of view that `max_time` or Ctrl-C has left
+        ``beam_radius`` R_b [m], and ``left_out_mrad``, as text the fields of view that time or Ctrl-C has left
         out.
 
     Raises
@@ -282,14 +265,14 @@ def fov_sweep(
     the noise. Errors in neighbouring circles are therefore correlated. They are jackknife estimates over the passes,
     which include the correlation between bins.
     """
-    fields = np.unique(fov_mrad)
-    session = open_scene(scene, _with_widest(scene, params, float(fields[-1])), instrument)
+    assert goal.passes is not None
+    (min_depth, max_depth), passes = limits, goal.passes
     lidar = find_lidar_scene(session.scene, session.sensor)
     geometry, edge = _geometry(lidar, 0.5e-3 * float(fields[-1]))
     column = ColumnBins.between(geometry, edge, lidar.axis, min_depth, max_depth)
-    water = _water(lidar, float(min_depth), float(max_depth))
-    _check_solids(lidar, geometry, edge, float(max_depth))
-    energy, log = _render(session, fields, Goal(passes=passes, max_time=max_time), seed, progress)
+    water = _water(lidar, min_depth, max_depth)
+    _check_solids(lidar, geometry, edge, max_depth)
+    energy, log = _render(session, fields, goal, seed, progress)
     left_out = ", ".join(f"{field:g}" for field in fields[len(energy) :])
     if left_out:
         logger.warning("fields of view of %s mrad are left out: their passes are not complete", left_out)
@@ -317,8 +300,8 @@ def fov_sweep(
         seed=seed,
         passes=passes,
         interrupted=int(log.interrupted),
-        min_depth=float(min_depth),
-        max_depth=float(max_depth),
+        min_depth=min_depth,
+        max_depth=max_depth,
         attenuation=water.attenuation,
         absorption=water.absorption,
         a_plus_bb=water.absorption + water.backscattering,

@@ -5,18 +5,16 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Instrument, Option, Scene, TargetId, checked, positive_option
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
-from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accumulators import PassAccumulator
@@ -36,41 +34,26 @@ _HALF_GATE = 1.0
 _GROUPS = 16
 
 
-@checked
-@alone
 def target_signal(
-    scene: Scene,
-    params: Mapping[str, Any] | None = None,
-    *,
-    instrument: Instrument = None,
-    target_id: TargetId = "target",
-    grid: Annotated[int, Option("Target positions along each axis", 1, 15)] = 1,
-    max_offset: Annotated[float, positive_option("Largest offset of these positions along each axis", "m")] = 2.0,
-    passes: Annotated[int, Option("Number of independent passes per render", _GROUPS, 100_000)] = 64,
-    max_time: Annotated[
-        float | None,
-        positive_option(
-            "Stop before this many seconds, shared among the positions, with fewer passes, at least 16 per position"
-        ),
-    ] = None,
-    seed: Annotated[int, Option("Random seed", -(2**63), 2**63 - 1)] = 0,
+    session: LoadedScene,
+    target_id: str = "target",
+    passes: int = 64,
+    max_time: float | None = None,
+    seed: int = 0,
     integrator: Any = None,
     axis: TimeAxis | None = None,
     progress: ProgressCallback | None = None,
+    *,
+    is_lit: bool = False,
 ) -> xr.Dataset:
-    """Render a scene with and without a target, and measure their difference; with a `grid`, at many positions.
+    """Render a scene with and without a target, and measure their difference.
 
     Both renders use the same random numbers: paths that do not meet the target are equal, so that the difference has
     much smaller errors than either record. The difference is the target echo, followed by the shadow in the water and
     on the bottom, which is negative.
 
-    Parameters
-    ----------
-    grid, max_offset
-        Target positions along each axis, and their largest offset from the position in the scene: the result is
-        `target_map` on a square.
-    axis
-        Time bins instead of automatic ones.
+    `passes`: independent passes per render, at least 16. `axis`: time bins instead of automatic ones. `is_lit`: whether
+    a target that returns no light is refused. Others as of `detection.detect`.
 
     Returns
     -------
@@ -85,9 +68,8 @@ def target_signal(
     Raises
     ------
     UserError
-        If the scene or a parameter is invalid, a number is out of range, there is no such shape, or it is above the sea
-        or below the bottom, or the sum of the pixels' echoes is not positive: the target returns no light, or too
-        little for these passes. Places of a map are not refused for that.
+        If the scene or a parameter is invalid, there is no such shape, or it is above the sea or below the bottom. With
+        `is_lit`, if the sum of the pixels' echoes is not positive: it returns no light, or too little for these passes.
 
     Notes
     -----
@@ -96,30 +78,6 @@ def target_signal(
     B)) [sqrt(J)], which is largest for w = E/B (matched filter): sqrt(sum(E^2/B)). Ratios of detectabilities are ratios
     of signal-to-noise ratios for every detector.
     """
-    if grid > 1:
-        offsets = np.linspace(-max_offset, max_offset, grid).tolist()
-        options: dict[str, Any] = {"target_id": target_id, "passes": passes, "seed": seed, "integrator": integrator}
-        options |= {"instrument": instrument, "max_time": max_time, "axis": axis, "progress": progress}
-        return target_map(scene, params, offsets, offsets, **options)
-    result = signal_at(
-        open_scene(scene, params, instrument), target_id, passes, max_time, seed, integrator, axis, progress
-    )
-    if not result["combined_echo"].sel(combination="sum") > 0:
-        raise UserError("target: it returns no light within the record; check its place, and the start of the record")
-    return result
-
-
-def signal_at(
-    session: LoadedScene,
-    target_id: str = "target",
-    passes: int = 64,
-    max_time: float | None = None,
-    seed: int = 0,
-    integrator: Any = None,
-    axis: TimeAxis | None = None,
-    progress: ProgressCallback | None = None,
-) -> xr.Dataset:
-    """Return the result of `target_signal` for one of several places or depths, even where the target is not seen."""
     chosen, with_target, without = _pair(session, target_id, integrator, axis)
     lidar = with_target.scene
     pixels, pulse = lidar.receiver.pixels, lidar.transmitter.pulse
@@ -136,18 +94,20 @@ def signal_at(
     goal = Goal(passes=passes, max_time=max_time)
     log = run_passes(render_pass, goal, seed=seed, smallest=_GROUPS, progress=progress)
     result = _measure(np.array(pairs), lidar.axis, kernel, pulse.fwhm_ns)
+    if is_lit and not result["combined_echo"].sel(combination="sum") > 0:
+        raise UserError("target: it returns no light within the record; check its place, and the start of the record")
     warn_of_edge_loss(log.edge_loss_share(float(np.sum(np.array(pairs)[:, 0]))))
     attributes = session.attributes(lidar, chosen, target=target_id, **log.attributes(seed), **result.attrs)
     return result.assign_coords(pixel=list(pixels.names)).assign_attrs(attributes)
 
 
-@alone
 def target_map(
     scene: Any,
     params: Mapping[str, Any] | None,
     x: Sequence[float],
     y: Sequence[float],
     *,
+    instrument: str | None = None,
     max_time: float | None = None,
     progress: ProgressCallback | None = None,
     **options: Any,
@@ -159,7 +119,7 @@ def target_map(
     over these alone. Raises `UserError` if the scene lacks the parameters ``target_x`` and ``target_y``, and
     KeyboardInterrupt if a render was interrupted.
     """
-    known = open_scene(scene, params, options.get("instrument")).parameters
+    known = open_scene(scene, params, instrument).parameters
     for name in ("target_x", "target_y"):
         if name not in known:
             raise UserError(f"scene {scene!r} has no parameter {name}: the map moves the target by it")
@@ -171,7 +131,7 @@ def target_map(
         moved = {**(params or {}), "target_x": place_x, "target_y": place_y}
         if max_time is not None:
             options["max_time"] = max(end - time.perf_counter(), 1e-3) / (1 + cases.left_out)
-        cell = cases.keep(target_signal(scene, moved, **options)).drop_dims("time")
+        cell = cases.keep(target_signal(open_scene(scene, moved, instrument), **options)).drop_dims("time")
         cells.append(cell.assign(place_passes=((), cell.attrs["passes"], described("place_passes"))))
         cases.step()
     rows = [cells[start : start + len(places[1])] for start in range(0, len(cells), len(places[1]))]

@@ -46,9 +46,7 @@ _TITLES = {
 
 @checked
 def describe_water(
-    kind: Annotated[
-        str, Option("jerlov, chlorophyll, kd, secchi, petzold, profile or pure", form="KIND", is_argument=True)
-    ],
+    kind: Annotated[str, Option("What is known of the water", form="|".join(REPORTED_KINDS), is_argument=True)],
     value: Annotated[
         str | None,
         Option(
@@ -80,8 +78,6 @@ def describe_water(
     UserError
         As for `water_of`, or if the file cannot be read.
     """
-    if kind not in REPORTED_KINDS:
-        raise UserError(f"kind = {kind!r} must be one of {', '.join(REPORTED_KINDS)}")
     index = float(seawater.refractive_index(wavelength_nm, temperature, salinity))
     group = float(seawater.group_index(wavelength_nm, temperature, salinity))
     if kind == "profile":

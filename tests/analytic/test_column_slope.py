@@ -11,7 +11,7 @@ from oracles.column_slope import effective_attenuation
 from significance import largest_z
 
 import mitransient_lidar
-from mitransient_lidar.studies.light_classes import fov_sweep
+from mitransient_lidar.studies.light_classes import scattering
 
 pytestmark = pytest.mark.long
 
@@ -36,7 +36,7 @@ def test_single_scattering_falls_with_c(field_of_view):
 @pytest.fixture(scope="module")
 def ocean():
     """The default water, whose forward peak holds most of the scattering, seen by a narrow beam."""
-    return fov_sweep("table1", {**VERTICAL, "divergence_mrad": 1}, fov_mrad=[1, 5, 20, 60, 150], passes=12, seed=3)
+    return scattering("table1", {**VERTICAL, "divergence_mrad": 1}, fov_mrad=[1, 5, 20, 60, 150], passes=12, seed=3)
 
 
 def test_slope_falls_from_c_to_absorption(ocean):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import mitransient_lidar
-from mitransient_lidar.studies.light_classes import scattering_orders
+from mitransient_lidar.studies.light_classes import scattering
 from mitransient_lidar.transport.paths.passes import PathClasses
 
 PARAMS = {"bin_width_ns": 2, "bin_count": 75, "surface_size": 200}
@@ -13,7 +13,7 @@ FEW = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**
 
 @pytest.fixture(scope="module")
 def parts():
-    return scattering_orders("fig09_2x2", PARAMS, orders=3, passes=2, seed=4, integrator=FEW)
+    return scattering("fig09_2x2", PARAMS, orders=3, passes=2, seed=4, integrator=FEW)
 
 
 @pytest.mark.long

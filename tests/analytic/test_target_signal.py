@@ -5,12 +5,17 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.studies.target_signal import describe_target, target_map, target_signal
+from mitransient_lidar.studies.detection import detect
+from mitransient_lidar.studies.target_signal import describe_target, target_map
 
 NEAR = {"surface_size": 200, "bin_count": 170}
 SMALL = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
 #: For what is refused.
 FEW = {**SMALL, "paths_per_pass": 1024, "photons_per_pass": 1024}
+
+
+def target_signal(*given, **options):
+    return detect(*given, receiver="none", **options)
 
 
 @pytest.fixture(scope="module")
@@ -107,3 +112,11 @@ def test_target_above_the_sea_is_refused(lidar_scene):
 def test_map_needs_a_target_that_can_be_moved():
     with pytest.raises(UserError, match="has no parameter target_x"):
         target_map("fig09_2x2", None, [0.0], [0.0], passes=16)
+
+
+@pytest.mark.slow
+def test_map_has_places_that_the_beam_misses():
+    maps = target_map("fig13_2x2", NEAR, x=[0.0, 60.0], y=[0.0], passes=16, integrator=FEW)
+    near, far = maps["combined_echo"].sel(combination="sum", target_y=0.0).values
+    assert near > 0
+    assert abs(far) < 1e-3 * near

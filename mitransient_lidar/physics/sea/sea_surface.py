@@ -13,7 +13,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import AUTO, Read
-from mitransient_lidar.core.validation import FloatArray, in_range
+from mitransient_lidar.core.validation import FloatArray, IntArray, in_range
 from mitransient_lidar.physics.sea.cox_munk import (
     GramCharlierSeries,
     cox_munk,
@@ -53,7 +53,7 @@ from mitransient_lidar.physics.sea.wind_spectra import (
 logger = logging.getLogger(__name__)
 
 #: Smallest slope variance of the ripples along one axis: a perfectly smooth facet has no connection to a point laser.
-_SMALLEST_RIPPLE_VARIANCE = 1e-5
+_LEAST_VARIANCE = 1e-5
 
 #: Unit of the sea period [m], its least length in peak wavelengths, and its largest length [m]. The period does not
 #: depend on the resolution, so that a seed defines one sea.
@@ -155,8 +155,7 @@ class SeaSurface:
 
         state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
         waves: PeriodicHeights | ShoalingHeights | HeightMap | None = None
-        waves_at: Callable[[float], PeriodicHeights | ShoalingHeights] | None = None
-        resolved = (0.0, 0.0)
+        waves_at, resolved = None, (0.0, 0.0)
         centre, cell, refined_size = resolution.centre, resolution.cell_size, resolution.refined_size
         if wake is not None and depths is not None:
             wake = limited_wake(wake, depths)
@@ -171,8 +170,7 @@ class SeaSurface:
                 motion = Motion(time, depth, drift)
                 _check_number_of_cells(refined_size, cell)
                 bands = None if depths is None else band_wavenumbers(state, resolution.shortest_wave)
-                given = state, period, cell, seed
-                rest = resolution.shortest_wave, bands
+                given, rest = (state, period, cell, seed), (resolution.shortest_wave, bands)
                 waves, cell, resolved = realise_heights(*given, motion, wind_direction, *rest)
                 bottom = None
                 if depths is not None and bands is not None:
@@ -196,13 +194,9 @@ class SeaSurface:
             cell = math.inf
         else:
             _check_number_of_cells(refined_size, cell)
-        along, across = (max(_SMALLEST_RIPPLE_VARIANCE, t - r) for t, r in zip(total, resolved, strict=True))
-        kind = spectrum if waves is not None else "flat"
-        size = resolution.size
-        patch = min(refined_size, size)
+        ripples = (max(_LEAST_VARIANCE, total[0] - resolved[0]), max(_LEAST_VARIANCE, total[1] - resolved[1]))
         lengths = (0.0, 0.0) if spectrum == "height_map" else (resolution.shortest_wave, resolution.beam_wave)
         shortest, beam_wave = (max(wave, 2 * cell) for wave in lengths)
-        ripples = along, across
         # Swell has no ripples of its own.
         is_whole = state is not None and isinstance(state.components[0], CosineSpectrum)
         if series is not None:
@@ -213,8 +207,9 @@ class SeaSurface:
                 f"they have {' and '.join(shares)} % of the slope variances along and across the wind: give a longer "
                 f"shortest_wave than {shortest:.3g} m"
             )
+        patch, size = min(refined_size, resolution.size), resolution.size
         return cls(
-            *(kind, wind_speed, wind_direction, waves, cell, centre, patch, size),
+            *(spectrum if waves is not None else "flat", wind_speed, wind_direction, waves, cell, centre, patch, size),
             *(resolved, ripples, wake, shortest, beam_wave, series, state if focuses and is_whole else None),
             waves_at,
             (slope[0], slope[1]),
@@ -255,11 +250,16 @@ class SeaSurface:
             return self._with_foam(mesh, x, y)
         cells = max(2, 2 * math.ceil(0.5 * self.refined_size / self.cell_size))
         indices = grid_indices(cells, math.ceil(self.size / self.cell_size))
+        return self._patch(self.centre, indices, (at_x, at_y), (0.0, 0.0))
+
+    def _patch(
+        self, centre: Sequence[float] | FloatArray, indices: IntArray, away: Sequence[float], moved: Sequence[float]
+    ) -> SeaMesh:
+        """Return the mesh about a centre on cells of the sea, from the place `away` moved to another one [m]."""
         # Integer cells: the sea does not depend on the position of the patch.
-        first = [round(centre / self.cell_size) for centre in self.centre]
-        x, y = (np.asarray((indices + start) * self.cell_size, dtype=np.float64) for start in first)
-        mesh = triangulate(self.heights_about(self.centre, x, y), x - at_x, y - at_y, self.wind_direction)
-        return self._with_foam(mesh, x, y)
+        x, y = (np.asarray((indices + round(at / self.cell_size)) * self.cell_size, np.float64) for at in centre)
+        lines = (x - away[0] + moved[0], y - away[1] + moved[1])
+        return self._with_foam(triangulate(self.heights_about(centre, x, y), *lines, self.wind_direction), x, y)
 
     def patches(
         self, places: FloatArray, refined_size: float, seas: Iterable[SeaSurface]
@@ -292,14 +292,8 @@ class SeaSurface:
         stride = (indices[-1] - indices[0] + 2) * self.cell_size
         number = np.arange(len(places))
         positions = stride * (np.stack([number % side, number // side], axis=-1) - 0.5 * (side - 1))
-        meshes = []
-        for place, position, sea in zip(places, positions, seas, strict=True):
-            # On the sea's cells, as in `mesh`.
-            x, y = ((indices + round(centre / self.cell_size)) * self.cell_size for centre in place)
-            lines = (x - place[0] + position[0], y - place[1] + position[1])
-            mesh = triangulate(sea.heights_about(place, x, y), *lines, self.wind_direction)
-            meshes.append(sea._with_foam(mesh, x, y))
-        return joined(meshes), positions
+        each = zip(places, positions, seas, strict=True)
+        return joined([sea._patch(place, indices, place, moved) for place, moved, sea in each]), positions
 
     @property
     def line_distance(self) -> float:
@@ -468,7 +462,7 @@ def _with_total_variance(
         number = float(slope_variance)
     except ValueError:
         raise UserError(f"slope_variance = {slope_variance!r} must be 'cox_munk', 'spectrum' or a number") from None
-    half = 0.5 * in_range("slope_variance", number, 2 * _SMALLEST_RIPPLE_VARIANCE, 1.0)
+    half = 0.5 * in_range("slope_variance", number, 2 * _LEAST_VARIANCE, 1.0)
     return state, (half, half)
 
 
@@ -501,6 +495,5 @@ def _read_wake(read: Read) -> Wake | None:
     """Return a ship's wake as a function of grid lines, None without a ship."""
     speed, length, x, y = map(read, ("wake_speed", "wake_length", "wake_x", "wake_y"))
     bearing = math.radians(read("wake_bearing_deg"))
-    if speed == 0:
-        return None
-    return partial(kelvin_wake, speed=speed, bearing=bearing, length=length, ship_x=x, ship_y=y)
+    wake = partial(kelvin_wake, speed=speed, bearing=bearing, length=length, ship_x=x, ship_y=y)
+    return wake if speed else None

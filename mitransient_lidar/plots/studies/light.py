@@ -26,6 +26,13 @@ _PANELS = (
 )
 
 
+def plot_scattering(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw a result of `studies.light_classes.scattering`."""
+    if "depth" in found.dims:
+        return plot_beam_spread(found, path)
+    return plot_fov_sweep(found, path) if "field_of_view" in found.dims else plot_scattering_orders(found, path)
+
+
 def plot_beam_spread(spread: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the light share at each depth within a radius, a horizontal shift and a delay.
 

@@ -104,8 +104,11 @@ def plot_detection(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
     """Draw the signals, the operating characteristics, the signal required for detection, and the depth error.
 
     `found` is a result of `studies.detection.detect`. For gates: the gates in which the target is brightest and darkest
-    against the noise, the weights in their sum, and the detection with frames and single gates.
+    against the noise, the weights in their sum, and the detection with frames and single gates. Without a receiver: the
+    target's signal.
     """
+    if "detection" not in found:
+        return plot_target_signal(found, path)
     if "gate" in found.dims:
         return _plot_image_detection(found, path)
     figure = drawing.new_figure(path, 12.5, 7.6)

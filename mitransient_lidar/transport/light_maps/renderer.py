@@ -87,7 +87,7 @@ _NO_BED = 1e6
 class Sampling:
     """Numbers of rays in a pass, and of their look-ups."""
 
-    rays: int = 512  #: Rays of the view.
+    rays: int  #: Rays of the view.
     #: Rays of the beam, and those that look for glints, for each of them.
     beam: float = 2.0
     glints: int = 8
@@ -138,10 +138,10 @@ class _Seen:
 
 
 class UnsuitedError(UserError):
-    """A scene that light maps are not for, for a reason, and what to use `instead`."""
+    """A scene that light maps are not for, for a reason."""
 
-    def __init__(self, reason: str, instead: str = "light = 'merging'") -> None:
-        super().__init__(f"light maps do not suit the scene: {reason}; use {instead}")
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"light maps do not suit the scene: {reason}; use light = 'merging'")
 
 
 class LightMapRenderer(PassRenderer):
@@ -149,8 +149,9 @@ class LightMapRenderer(PassRenderer):
 
     Paths that change more than once between down and up are left out, and the shadows of solids in the beam.
 
-    `level`: whether the sea is level, with all of its slopes as ripples, as the mean over seas. `image`: whether a pass
-    is one of few for a render, instead of one for a shot among many.
+    `level`: whether the sea is level, with all of its slopes as ripples, as the mean over seas, enhanced by the
+    focusing of all waves (`physics.sea.double_passage`). `image`: whether a pass is one of few for a render, instead of
+    one for a shot among many.
 
     Raises
     ------
@@ -161,11 +162,11 @@ class LightMapRenderer(PassRenderer):
     def __init__(self, scene: LidarScene, classes: PathClasses, *, level: bool = False, image: bool = False) -> None:
         reason = unsuited(scene) or ((level or image) and scene.has_dry_solids and REACH_THE_SURFACE)
         if reason:
-            raise UnsuitedError(reason, *(["render"] if level else []))
+            raise UnsuitedError(reason)
         water, axis = scene.required_water, scene.receiver.pose.axis
         cos_water = -float(refract_level(axis, scene.refractive_index)[2])
         planes = Planes.of_scene(scene, _deepest(scene, cos_water), _PLANES + 1)
-        self._sampling = Sampling.of_image(scene, planes) if image else Sampling()
+        self._sampling = Sampling.of_image(scene, planes) if image else Sampling(1024 if level else 512)
         self._planes = replace(planes, cells=self._sampling.cells)
         # Waves of the mesh enhance what cells average less than what meets at points.
         super().__init__(scene, classes, self._sampling.rays, _far_apart if level else self._planes.cell)

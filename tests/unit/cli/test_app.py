@@ -97,23 +97,19 @@ def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("command", "describe", "module"),
+    ("command", "describe", "plot"),
     [
-        ("target-signal", "describe_target", "targets"),
-        ("beam-spread", "describe_spread", "light"),
-        ("fov-sweep", "describe_fov_sweep", "light"),
-        ("scattering-orders", "describe_orders", "light"),
+        ("detect", "describe_detection", "targets:plot_detection"),
+        ("scattering", "describe_scattering", "light:plot_scattering"),
     ],
 )
-def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, describe, module, monkeypatch, tmp_path):
+def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, describe, plot, monkeypatch, tmp_path):
     """Their drawings are of the passes until then; the exit code was once 0."""
-    name = command.replace("-", "_")
     study = COMMANDS[command].function.partition(":")[0]
     stub(monkeypatch, command, lambda **_: xr.Dataset(attrs={"interrupted": 1, "passes": 3}))
     monkeypatch.setattr(f"mitransient_lidar.{study}.{describe}", lambda _: ["lines"])
-    monkeypatch.setattr(f"mitransient_lidar.plots.studies.{module}.plot_{name}", lambda *_: None)
-    depths = ["--depths", "3"] if command == "beam-spread" else []
-    done = run(command, "table1", *depths, "-o", tmp_path / "out.png", "-q")
+    monkeypatch.setattr(f"mitransient_lidar.plots.studies.{plot.replace(':', '.')}", lambda *_: None)
+    done = run(command, "table1", "-o", tmp_path / "out.png", "-q")
     assert done.stdout.splitlines() == [str(tmp_path / "out.nc"), "lines"]
     assert (done.exit_code, done.stderr) == (130, "interrupted after 3 passes; their result is kept\n")
 

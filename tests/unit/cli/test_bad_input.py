@@ -148,7 +148,7 @@ OPTIONS = [
         (["view", "/dev/zero"], "/dev/zero: it is a device"),
         (["view", "missing.nc"], "missing.nc"),
         (["echoes", "/dev/zero"], "/dev/zero"),
-        (["water", "mud"], "kind = 'mud' must be one of jerlov"),
+        (["scenes", "water", "mud"], "kind = 'mud' must be one of jerlov"),
         (["compare", "/dev/zero", "/dev/zero"], "/dev/zero: it is a device"),
         (["gates", "/dev/zero", "--start-ns", 1, "--width-ns", 1, "--count", 1], "/dev/zero"),
     ],

@@ -5,11 +5,10 @@ import shutil
 
 import pytest
 import synthetic_shots
-from command_line import GROUP, assert_refused, run, stub
+from command_line import COMMANDS, MADE, assert_refused, run, stub
 
 from mitransient_lidar import results
 from mitransient_lidar.cli import files, overwriting
-from mitransient_lidar.cli.app import COMMANDS
 from mitransient_lidar.core.marks import holds_mark, read_mark, write_mark
 
 #: Wrong options, found after the check of the files and before the render.
@@ -51,9 +50,7 @@ CASES = {
     ),
     "shots": (["table1", *WRONG, "-o", "d/s.nc", "--figure", "d/f.svg"], ["d/s.nc", "d/f.svg", "d/f.nc"], OTHER),
     "find-shots": figure("table1", files=["png"]),
-    "target-signal": figure("fig13_2x2", files=("pdf", "nc")),
-    "detect": figure("fig13_2x2"),
-    "estimate": figure("table1"),
+    "detect": figure("fig13_2x2", files=("pdf", "nc")),
     "depth-bias": (
         ["riegl_vq840g", *WRONG, "-o", "d/t.nc", "--figure", "d/t.png"],
         ["d/t.nc", "d/t.png"],
@@ -66,10 +63,8 @@ CASES = {
     ),
     "forecast": figure("riegl_vq840g", "1:3", files=("png", "nc", "tif"), other=INSTRUMENT),
     "bounds": figure("table1", "--free", "bottom_depth", files=("png", "nc", "csv")),
-    "beam-spread": figure("table1", "--depths", "2"),
-    "fov-sweep": figure("table1"),
-    "scattering-orders": figure("table1"),
-    "water": (["jerlov", "no_such_type", "-o", "d/f.png"], ["d/f.png"], {"kind": "petzold"}),
+    "scattering": figure("table1"),
+    "scenes water": (["jerlov", "no_such_type", "-o", "d/f.png"], ["d/f.png"], {"kind": "petzold"}),
     "figures": (["fig09", "--target-error", "-1", "-o", "d"], ["d/fig09.png", "d/statements.csv"], None),
     "view": (["damaged.nc", "-o", "d/v.html", "--no-browser"], ["d/v.html"], OTHER),
     "view plot": (["damaged.nc", "--plot"], ["damaged.png"], OTHER),
@@ -99,8 +94,13 @@ CASES = {
 FILES = [(name, file) for name, (_, targets, _) in CASES.items() for file in targets]
 
 
+def words(name):
+    """Return the words of a case's command."""
+    return name if name in COMMANDS else name.split()[0]
+
+
 def command(name, *more):
-    return run(name.split()[0], *CASES[name][0], *more)
+    return run(words(name), *CASES[name][0], *more)
 
 
 @pytest.fixture(autouse=True)
@@ -174,7 +174,7 @@ def test_files_of_the_same_command_and_scene_may_be_replaced(name, write_before,
     assert "is kept" not in done.stderr
     path = folder / next(file for file in CASES[name][1] if holds_mark(folder / file))
     mark, other = read_mark(path), CASES[name][2]
-    if name in ("render", "view plot", "water"):
+    if name in ("render", "view plot", "scenes water"):
         # All commands take these from the mark alone.
         change_mark(path, elapsed_s=75.0)
         assert_refused(command(name), "since it took 75 s to make", "--overwrite", "-")
@@ -195,9 +195,8 @@ def test_table_that_was_edited_is_kept(name, write_before, folder):
 
 
 def test_every_command_with_an_output_is_tested():
-    with_output = {name for name in COMMANDS if "overwrite" in {one.name for one in GROUP.commands[name].params}}
-    assert {name.split()[0] for name in CASES} == with_output
-    assert set(COMMANDS) - with_output == {"info", "bench"}
+    with_output = {name for name in COMMANDS if "overwrite" in {one.name for one in MADE[name].params}}
+    assert {words(name) for name in CASES} == with_output - {"scenes copy"}
 
 
 def line(done):
@@ -219,25 +218,27 @@ def small_figures(monkeypatch):
 @pytest.mark.usefixtures("small_figures")
 @pytest.mark.slow
 def test_line_names_what_differs(folder):
-    first = ["estimate", "table1", "--paths", 64, "-o", "d/a.png"]
+    few = ["--depths", 2, "--passes", 2, "-o", "d/a.png"]
+    first = ["scattering", "table1", *few]
     assert line(run(*first)) == []
-    done = run(*first[:2], "-D", "wind_speed=6", "--paths", 128, "-o", "d/a.png")
-    assert line(done) == ["replaces d/a.nc and 1 more: wind_speed 3 -> 6, paths 64 -> 128"]
-    assert_refused(run("estimate", "fig09_2x2", "-o", "d/a.png"), "since its scene is table1")
-    mounted = ["estimate", "table1", "--instrument", "riegl_vq840g", "-o", "d/a.png"]
+    done = run(*first, "-D", "wind_speed=6", "--photons", 2048)
+    assert line(done) == ["replaces d/a.nc and 1 more: wind_speed 3 -> 6, photons 65536 -> 2048"]
+    assert_refused(run("scattering", "fig09_2x2", *few), "since its scene is table1")
+    mounted = [*first, "--instrument", "riegl_vq840g"]
     assert_refused(run(*mounted), "since its instrument is another one")
-    assert_refused(run("view", "--plot", "d/a.nc"), "d/a.png is kept, since the command estimate has written it", "-o")
-    done = run("estimate", "fig09_2x2", "--paths", 64, "-o", "d/a.png", "--overwrite")
+    drawn = run("view", "--plot", "d/a.nc")
+    assert_refused(drawn, "d/a.png is kept, since the command scattering has written it", "-o")
+    done = run("scattering", "fig09_2x2", *few, "--overwrite")
     assert line(done) == ["replaces d/a.nc and 1 more: its scene is table1"]
     assert done.exit_code == 0
     # Files of one name in two folders are two scenes.
     for name in ("a", "b"):
         (folder / name).mkdir()
         run("scenes", "copy", "table1", f"{name}/lab.xml")
-    estimate = ["estimate", "--paths", 64, "-o", "d/f.png"]
-    assert run(*estimate, "a/lab.xml").exit_code == 0
-    assert_refused(run(*estimate, "b/lab.xml"), "since its scene file is ../a/lab.xml")
-    assert run(*estimate, folder / "a/lab.xml").exit_code == 0
+    few = ["scattering", *few[:-1], "d/f.png"]
+    assert run(*few, "a/lab.xml").exit_code == 0
+    assert_refused(run(*few, "b/lab.xml"), "since its scene file is ../a/lab.xml")
+    assert run(*few, folder / "a/lab.xml").exit_code == 0
 
 
 def test_result_of_an_earlier_release_counts_by_its_attributes(folder):
@@ -265,9 +266,9 @@ def test_file_made_meanwhile_keeps_its_name(folder, monkeypatch):
         (folder / "d/f.nc").write_text("mine")
         return found(*arguments, **options)
 
-    found = light_classes.estimate
-    stub(monkeypatch, "estimate", slow)
-    done = run("estimate", "table1", "--paths", 64, "-o", "d/f.png")
+    found = light_classes.scattering
+    stub(monkeypatch, "scattering", slow)
+    done = run("scattering", "table1", "--depths", 2, "--passes", 2, "-o", "d/f.png")
     assert done.exit_code == 0
     assert "d/f.nc is kept, since no command has written it as it is: the new file is d/f_2.nc." in done.stderr
     assert (folder / "d/f.nc").read_text() == "mine"

@@ -8,7 +8,7 @@ import pytest
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.studies.beam_spread import beam_spread
+from mitransient_lidar.studies.light_classes import scattering
 
 QUICK = {"passes": 2, "photons": 4096}
 
@@ -27,21 +27,21 @@ def test_what_is_refused(lidar_scene, change, options, message):
     dry = {"tx": {"type": "lidar_transmitter"}, "rx": receiver, "plate": {"type": "rectangle"}}
     given = {name: part for name, part in dry.items() if name not in change["without"]} if change else lidar_scene()
     with pytest.raises(UserError, match=re.escape(message)):
-        beam_spread(given, **{"depths": 2.0, **QUICK, **options})
+        scattering(given, **{"depths": 2.0, **QUICK, **options})
 
 
 @pytest.mark.slow
 def test_only_what_is_wider_than_the_beam_is_a_bottom(lidar_scene):
     plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([2, 0, -4]).scale(0.75)}
     scene = lidar_scene(bottom=None, extra={"target": plate})
-    found = beam_spread(scene, depths=6.0, **QUICK)
-    without = beam_spread(lidar_scene(bottom=None), depths=6.0, **QUICK)
+    found = scattering(scene, depths=6.0, **QUICK)
+    without = scattering(lidar_scene(bottom=None), depths=6.0, **QUICK)
     assert 0.1 < float(found["transmitted"].item()) < 0.9 * float(without["transmitted"].item())
 
 
 @pytest.mark.slow
 def test_result():
-    spread = beam_spread("fig09_1x1", {"bottom_depth": 8}, depths=[8, 2.0, 2.0], **QUICK)
+    spread = scattering("fig09_1x1", {"bottom_depth": 8}, depths=[8, 2.0, 2.0], **QUICK)
     assert spread["depth"].values.tolist() == [2, 8]
     for name, values in spread.data_vars.items():
         assert values.attrs["units"] in ("1", "m", "ns")
@@ -73,7 +73,7 @@ def test_share_in_view(lidar_scene, off_nadir):
         sea={"slope_variance": "2e-5"},
         water={"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0},
     )
-    found = beam_spread(scene, depths=[1.0, 7.0], passes=4, photons=2**14)
+    found = scattering(scene, depths=[1.0, 7.0], passes=4, photons=2**14)
     # Photons count as if they were drawn one by one; 0.2 % for the ripples.
     share = 1 - np.exp(-0.5 * 1.2**2)
     error = np.sqrt(share * (1 - share) / (4 * 2**14))
@@ -86,7 +86,7 @@ def test_share_in_view(lidar_scene, off_nadir):
 
 def test_beam_outside_the_surface_is_reported(lidar_scene, caplog):
     scene = lidar_scene(sea={"spectrum": "flat", "size": 2.0}, bottom=4.0)
-    found = beam_spread(scene, depths=2.0, **QUICK)
+    found = scattering(scene, depths=2.0, **QUICK)
     # Standard deviations of the footprint are 1.064 m across and 1.132 m along, erf(1/(sqrt(2) sigma)) in the patch.
     assert found.attrs["beam_outside_surface"] == pytest.approx(1 - 0.6526 * 0.6230, abs=0.01)
     assert "passes outside it and is left out" in caplog.text

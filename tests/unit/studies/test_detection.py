@@ -253,8 +253,7 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
         coords = {"pixel": ["red", "green", "blue", "black"], "time": 0.5 + T}
         return xr.Dataset({name: (("pixel", "time"), values) for name, values in data.items()}, coords)
 
-    for name in ("target_signal", "signal_at"):
-        monkeypatch.setattr(detection, name, signal)
+    monkeypatch.setattr(detection, "target_signal", signal)
     done = []
     # Ten meshes are made, of which nothing is rendered.
     coarse = {"surface_size": 60, "surface_cell_size": 0.5}
@@ -351,6 +350,8 @@ def test_echoes_that_are_not_recorded_are_reported(monkeypatch, late, receiver, 
         ("fig13_2x2", {"spectrum": "flat"}, {"clutter": 4}, "clutter needs waves"),
         ({}, None, {"clutter": 4}, "depths and clutter need an XML scene"),
         ("fig02_mine", GATES, {"receiver": "apd"}, r"is an image of 8x8: it needs gates and a camera \(iccd, "),
+        ("fig13_2x2", {}, {"grid": 3}, "grid = 3 maps the target's signal alone: it needs receiver = 'none'"),
+        ("fig13_2x2", {}, {"receiver": "none", "depths": [4]}, "alone: leave out depths and clutter"),
         ("fig02_mine", {}, {"receiver": "icmos"}, "scene fig02_mine has no gates, which a camera needs"),
     ],
 )

@@ -49,7 +49,7 @@ def figures(output):
     ],
 )
 def test_every_kind_is_printed_and_can_be_rendered(arguments, wanted):
-    named, options = figures(run("water", *arguments.split()).stdout)
+    named, options = figures(run("scenes", "water", *arguments.split()).stdout)
     assert named["absorption a (1/m)"] == pytest.approx(wanted.absorption, rel=1e-4)
     assert named["diffuse attenuation Kd (1/m)"] == pytest.approx(wanted.kd, rel=1e-4)
     assert options["attenuation"] == pytest.approx(wanted.absorption + wanted.scattering, rel=1e-5)
@@ -77,7 +77,7 @@ def test_every_kind_is_printed_and_can_be_rendered(arguments, wanted):
     ],
 )
 def test_mistakes_are_one_sentence(arguments, message):
-    assert_refused(run("water", *arguments), message)
+    assert_refused(run("scenes", "water", *arguments), message)
 
 
 @each_row(
@@ -86,7 +86,7 @@ def test_mistakes_are_one_sentence(arguments, message):
     [("clear", 0.114, 0.037, 0.044), ("coastal", 0.179, 0.219, 0.013), ("turbid", 0.366, 1.824, 0.020)],
 )
 def test_petzold_waters(name, a, b, ratio):
-    done = run("water", "petzold", name)
+    done = run("scenes", "water", "petzold", name)
     assert "measured at 514 to 530 nm" in done.stdout
     named, options = figures(done.stdout)
     assert named["absorption a (1/m)"] == a
@@ -96,7 +96,7 @@ def test_petzold_waters(name, a, b, ratio):
 
 
 def test_profile_is_described(station):
-    lines = run("water", "profile", station, "--tolerance", "0.05").stdout.splitlines()
+    lines = run("scenes", "water", "profile", station, "--tolerance", "0.05").stdout.splitlines()
     named = {line[:30].strip(): line[30:] for line in lines if re.match(r".{30}[0-9]", line)}
     assert named["depth (m)"] == "1 to 10"
     ends = {"absorption a": "0.05 to 0.3", "scattering b": "0.1 to 0.6", "attenuation c": "0.15 to 0.9"}
@@ -113,11 +113,11 @@ def test_profile_is_described(station):
 @pytest.mark.slow
 def test_profile_line_is_xml_for_a_medium(station):
     """The path in the XML is absolute and complete, with its spaces and signs, and valid in every folder."""
-    done = run("water", "profile", str(station), "--tolerance", "0.05")
+    done = run("scenes", "water", "profile", str(station), "--tolerance", "0.05")
     medium = ElementTree.fromstring(f"<medium>{done.stdout.splitlines()[-1]}</medium>")
     given = {child.get("name"): child.get("value") for child in medium}
     assert given == {"profile": str(station), "profile_tolerance": "0.05"}
-    usual = run("water", "profile", str(station)).stdout.splitlines()[-1]
+    usual = run("scenes", "water", "profile", str(station)).stdout.splitlines()[-1]
     assert "profile_tolerance" not in usual
     for element, tolerance in ((done.stdout.splitlines()[-1], 0.05), (usual, 0.01)):
         loaded = mi.load_string(f'<medium version="3.0.0" type="layered_water">{element}</medium>')
@@ -126,7 +126,7 @@ def test_profile_line_is_xml_for_a_medium(station):
 
 def test_pure_sea_water_renders():
     """No Fournier-Forand function has bb/b = 0.5: without its own scattering the medium would be refused."""
-    done = run("water", "pure")
+    done = run("scenes", "water", "pure")
     _, options = figures(done.stdout)
     names = ("attenuation", "scattering", "backscattering")
     values = {name: options[name] for name in names}

@@ -11,7 +11,7 @@ from mitransient_lidar.analysis.retrieval.column_retrieval import ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.studies.light_classes import fov_sweep, slope_and_error
+from mitransient_lidar.studies.light_classes import scattering, slope_and_error
 
 C0 = 0.299792458  # m/ns
 HEIGHT, INDEX, GROUP = 150.0, 1.33, 1.4
@@ -86,4 +86,4 @@ SCENE = {"off_nadir_deg": 0, "spectrum": "flat", "slope_variance": 1e-4, "time_s
 )
 def test_scenes_and_options_that_do_not_serve(fields, options, params, message):
     with pytest.raises(UserError, match=message):
-        fov_sweep("table1", {**SCENE, "bin_count": 110, **params}, fov_mrad=fields, **{"passes": 4, **options})
+        scattering("table1", {**SCENE, "bin_count": 110, **params}, fov_mrad=fields, **{"passes": 4, **options})

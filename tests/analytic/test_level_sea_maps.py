@@ -1,4 +1,4 @@
-"""The fast estimate against renders of a level sea."""
+"""Light maps below a level sea against renders of one."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,12 @@ import significance
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.studies.light_classes import describe_estimate, estimate
 
 LEVEL = {"spectrum": "flat"}
+
+
+def look(scene, params, **options):
+    return mitransient_lidar.render(scene, params, light="level", components=True, **options)
 
 
 def by_origin(dataset, origin):
@@ -34,30 +37,26 @@ def by_origin(dataset, origin):
     ],
     ids=["four", "narrow", "strips", "skewed slopes"],
 )
-def test_estimate_agrees_with_renders(params, water):
+def test_level_sea_agrees_with_renders(params, water):
     """Levels and times of each pixel; the water lacks light that turned twice."""
     params = {**LEVEL, **params}
     few = {"type": "lidar_merging", "paths_per_pass": 2**14, "photons_per_pass": 2**14}
     rendered = mitransient_lidar.render("table1", params=params, integrator=few, passes=12, components=True, seed=3)
-    found = estimate("table1", params, paths=2**15, seed=significance.seed_shift)
+    found = look("table1", params, passes=32, seed=significance.seed_shift)
     for origin, bias, shift in (("surface", 0.012, 0.05), ("water", water, 0.3), ("bottom", 0.01, 0.1)):
         energy, error, time = by_origin(found, origin)
         wanted, spread, arrival = by_origin(rendered, origin)
-        # Eight parts and twelve passes, the largest of four pixels.
-        limit = significance.largest_z(8, 4) * np.hypot(error, spread)
+        # 32 and twelve passes, the largest of four pixels.
+        limit = significance.largest_z(12, 4) * np.hypot(error, spread)
         assert np.all(abs(energy - wanted) < limit + bias * wanted), origin
         assert np.all(abs(time - arrival) < shift + 8 * limit / wanted), origin
 
 
-def test_estimate_is_a_result_with_components():
-    found = estimate("table1", {**LEVEL, "jerlov": "1C"}, paths=2**11)
-    assert found["waveform_by_origin"].dims == ("origin", "pixel", "time")
+def test_first_look_has_eight_passes_and_is_rendered_again():
+    found = look("table1", {**LEVEL, "jerlov": "1C"})
+    assert (found.attrs["light"], found.attrs["passes"]) == ("level", 8)
     np.testing.assert_allclose(found["waveform_by_origin"].sum("origin"), found["waveform"], rtol=1e-12)
-    assert found.attrs["model"] == "estimate"
-    lines = describe_estimate(found)
-    assert [line.split()[0] for line in lines] == ["all", "surface", "water", "bottom"]
-    again = estimate("table1", {**LEVEL, "jerlov": "1C"}, paths=2**11)
-    np.testing.assert_array_equal(again["waveform"], found["waveform"])
+    np.testing.assert_array_equal(mitransient_lidar.render(found)["waveform"], found["waveform"])
 
 
 @pytest.mark.parametrize(
@@ -72,9 +71,11 @@ def test_estimate_is_a_result_with_components():
 )
 def test_scenes_that_the_model_is_not_for(scene, params, message):
     with pytest.raises(UserError, match=message):
-        estimate(scene, params)
+        look(scene, params)
 
 
-def test_numbers_out_of_range():
-    with pytest.raises(UserError, match="paths = 10 must"):
-        estimate("table1", LEVEL, paths=10)
+def test_series_and_derivatives_need_other_light():
+    with pytest.raises(UserError, match="light = 'level' must be one of merging, maps"):
+        mitransient_lidar.render_shots("table1", LEVEL, count=2, light="level")
+    with pytest.raises(UserError, match="light = 'level' has no derivatives"):
+        look("table1", LEVEL, derivatives="attenuation")
