@@ -75,8 +75,8 @@ class HeightFields:
         """Return the field about the place of a scene's own shot, or one of a level sea there."""
         (sea,), pose = scene.seas, scene.receiver.pose
         place = pose.in_scene(pose.ground_point())[None, :2]
-        heights, corners = sea.sea.height_patches(place, sea.footprint_size, [sea.sea])
-        heights = np.zeros((1, 3, 3)) if level else heights
+        level_sea = np.zeros((1, 3, 3)), place
+        heights, corners = level_sea if level else sea.sea.height_patches(place, sea.met_size, [sea.sea])
         part = ScenePart(scene.mitsuba_scene, opaque_vector(scene.frame_origin))
         return cls.of_patches(heights, corners, sea.sea.line_distance, sea.sea.wind_direction, part)
 
