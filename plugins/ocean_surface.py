@@ -23,6 +23,10 @@ from mitransient_lidar.transport.plugin_types import WaterMedium
 #: Parameter of the loader: whether the mesh is a level plane until `OceanSurface.fit` gets the lidar.
 WAITS = "_waits"
 
+#: Margin of where rays meet the waves [m], heights of waves at any time over those of the mesh, and angle of the rays
+#: from the vertical up to which the margin grows [rad].
+_MET_MARGIN, _WAVES_PER_MESH, _STEEPEST = 0.5, 1.5, 1.3
+
 #: Mesh buffers that `OceanSurface.fit` makes anew.
 _BUFFERS = {"faces", "vertex_positions", "vertex_normals", "vertex_texcoords"}
 
@@ -215,6 +219,15 @@ class OceanSurface(mi.Mesh):
         whole = self.sea.refined_size
         return max(whole - SIZE_MARGIN, 0.5 * whole) if self._values["refined_size"] == "auto" else whole
 
+    @property
+    def met_size(self) -> float:
+        """Side of the patch in which the lidars' rays meet the waves [m], at most `footprint_size`."""
+        if self._resolution is None or not self.footprints:
+            return self.footprint_size
+        box, steepest = self.bbox(), max(each.off_nadir + each.half_angle for each in self.footprints)
+        beside = max(-float(box.min.z), float(box.max.z)) * np.tan(min(steepest, _STEEPEST))
+        return min(self.footprint_size, self._resolution.footprint + 2 * (_WAVES_PER_MESH * beside + _MET_MARGIN))
+
     def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
         """Return the BSDF of ripples whose slope variances are those of the sea times a factor."""
         return self._foamed(self._ripples(refractive_index, (factor, factor)), refractive_index)
@@ -295,9 +308,9 @@ class SeaPatches:
         return [self._surface.sea] * len(places) if times_s is None else map(self._surface.sea.at, times_s.tolist())
 
     def heights(self, places: FloatArray, times_s: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return the heights of the patches, as of `SeaSurface.height_patches`, without a mesh."""
+        """Return the heights where rays meet the patches, as of `SeaSurface.height_patches`, without a mesh."""
         sea = self._surface.sea
-        return sea.height_patches(places, self._surface.footprint_size, self._seas(places, times_s))
+        return sea.height_patches(places, self._surface.met_size, self._seas(places, times_s))
 
     @property
     def cell_size(self) -> float:

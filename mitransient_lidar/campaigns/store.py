@@ -45,7 +45,7 @@ PLANNED, DONE, FAILED = 0, 1, 2
 _FEWEST, _MOST, _SHARDS = 8, 1024, 16
 
 #: Largest size of a shard in memory [bytes], by default.
-_MOST_BYTES = 2**29
+LARGEST_BYTES = 2**29
 
 #: Memory per byte of a shard: itself, and its chunk while that is written.
 BYTES_PER_BYTE = 2
@@ -132,7 +132,7 @@ class Store:
         count = len(next(iter(columns.values())))
         bytes_of_run = sum(array.values.nbytes for array in arrays.values())
         size = int(np.clip(-(-count // _SHARDS), min(_FEWEST, count), _MOST))
-        size = max(min(size, _MOST_BYTES // max(bytes_of_run, 1)), 1)
+        size = max(min(size, LARGEST_BYTES // max(bytes_of_run, 1)), 1)
         size = size if shard_size is None else integer("shard_size", shard_size, 1, LARGEST_SHARD)
         needed = BYTES_PER_BYTE * bytes_of_run * min(size, count)
         require_memory(f"shards of {size} runs", needed, "take a smaller shard_size, or fewer pixels or bins")

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import xarray as xr
 
-from mitransient_lidar.campaigns.store import LARGEST_SHARD, Store
+from mitransient_lidar.campaigns.store import LARGEST_BYTES, LARGEST_SHARD, Store
 from mitransient_lidar.campaigns.sweep import ProcessCount, Scheduler, complete
 from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.options import Option, checked
@@ -23,8 +23,9 @@ from mitransient_lidar.rendering.passes import ProgressCallback
 #: Name of the store in the folder of a flight.
 STORE = "flight.zarr"
 
-#: Fewest and most pulses of a shard, whose process takes as long to start as 120 of them, and shards of a flight.
-_FEWEST, _MOST, _SHARDS = 512, 1024, 8
+#: Fewest and most pulses of a shard, whose process takes as long to start as 1000 of them by maps, and shards of a
+#: flight.
+_FEWEST, _MOST, _SHARDS = 1024, 8192, 8
 
 #: Pulses whose arrays show those of the store.
 _SAMPLE = 2
@@ -44,7 +45,7 @@ def fly(
     shard_size: Annotated[
         int | None,
         Option(
-            "Pulses that one process renders and writes, by default an eighth of them, but 512 to 1024 in number",
+            "Pulses that one process renders and writes, by default an eighth of them, but 1024 to 8192 in number",
             *(1, LARGEST_SHARD),
         ),
     ] = None,
@@ -64,8 +65,8 @@ def fly(
     workers, scheduler
         As for `campaigns.sweep.campaign`.
     shard_size
-        Pulses per shard, which one process renders and writes, 1 to 10^6. Defaults to an eighth of all, but 512 to
-        1024. The bits depend on it.
+        Pulses per shard, which one process renders and writes, 1 to 10^6. Defaults to an eighth of all, but 1024
+        to 8192, and fewer where a shard would need more than half a gigabyte. The bits depend on it.
     progress
         Called with a `rendering.passes.Progress` about every second.
 
@@ -109,5 +110,7 @@ def _prepare(plan: FlightPlan, path: Path, shard_size: int | None, progress: Pro
     with telling_errors_alone():
         arrays, coordinates, attributes = renderer.sample({name: column[:_SAMPLE] for name, column in columns.items()})
     count = len(columns["pulse"])
-    size = min(max(-(-count // _SHARDS), _FEWEST), _MOST, count) if shard_size is None else shard_size
-    return Store.create(path, renderer, columns, arrays, coordinates, size, attributes)
+    if shard_size is None:
+        in_memory = LARGEST_BYTES // sum(array.values.nbytes for array in arrays.values())
+        shard_size = min(max(-(-count // _SHARDS), _FEWEST), _MOST, max(in_memory, 1), count)
+    return Store.create(path, renderer, columns, arrays, coordinates, shard_size, attributes)

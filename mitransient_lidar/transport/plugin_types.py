@@ -102,9 +102,9 @@ class SeaShape(Protocol):
     sea: sea_surface.SeaSurface
     has_ripples: bool
     footprints: Sequence[Footprint] | None
-    #: Wave time [s], and side of the fine patch without an automatic margin for scattered light [m].
+    #: Wave time [s], and side of the patch in which rays of beam and view meet the waves [m].
     time_s: float
-    footprint_size: float
+    met_size: float
     #: As `OceanSurface` documents them.
     fit: Callable[..., bool]
     rippled: Callable[[float], mi.BSDF]

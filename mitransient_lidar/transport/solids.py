@@ -178,7 +178,8 @@ def bottom_depths(scene: mi.Scene) -> BottomDepths | None:
         top = float(highest[2]) + _MARGIN
         origins = np.stack([east, north, np.full(east.size, top)], axis=1)
         down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
-        met = alone().ray_intersect_preliminary(aligned_ray(origins, down, np.full(east.size, np.inf)))
+        rays = aligned_ray(origins, down, np.full(east.size, np.inf))
+        met = alone().ray_intersect_preliminary(rays, coherent=True)
         distance = np.array(met.t, dtype=np.float64)
         depth = np.where(np.isfinite(distance), distance - top, DEEP)
         return np.asarray(depth.reshape(len(y), len(x)))

@@ -31,9 +31,10 @@ def lidar_of(params, scene="table1"):
     return find_lidar_scene(session.scene, session.sensor), session
 
 
-def test_rays_meet_the_faces_that_the_mesh_has():
-    """A wave of another place, a mirrored grid or the other diagonal differ by centimetres and degrees."""
-    lidar, _session = lidar_of({"wind_speed": 6, "off_nadir_deg": 30, "wind_direction_deg": 40})
+@pytest.mark.parametrize("narrow", [{}, {"divergence_mrad": 0.5, "field_of_view_mrad": 2, "wind_speed": 12}])
+def test_rays_meet_the_faces_that_the_mesh_has(narrow):
+    """Waves of another place, a mirrored grid, the other diagonal and a small patch differ by centimetres."""
+    lidar, _session = lidar_of({"wind_speed": 6, "off_nadir_deg": 30, "wind_direction_deg": 40, **narrow})
     lanes = Shots([0]).paths(4096)
     sample = Probe(lidar).sampler.sample_shots(lanes, 4096, Shots([0]).streams(1, lanes))
     start, _ = lidar.first_points(lidar.receiver.pose, sample.angles, sample.direction)

@@ -178,6 +178,7 @@ class Resolution:
     size: float  #: Side of the whole surface.
     shortest_wave: float  #: Shortest wavelength.
     beam_wave: float  #: The shortest waves that the beam alone needs, not shorter than those.
+    footprint: float  #: Side of the square of the footprints, and a quarter of it.
 
     @classmethod
     def read(cls, read: Read, footprints: Sequence[Footprint]) -> Resolution:
@@ -220,7 +221,7 @@ class Resolution:
             patch = min(patch, _MOST_CELLS * cell)
         # The waves do not depend on the cells: finer cells show the same sea.
         own, beam = (wave or min(max(one, _SMALLEST_WAVE), _LARGEST_WAVE) for one in (waves, lit_waves))
-        return cls((centre[0], centre[1]), cell, patch, size, own, beam)
+        return cls((centre[0], centre[1]), cell, patch, size, own, beam, _SIZE_PER_FOOTPRINT * areas[0][2])
 
 
 def _square(footprints: Sequence[Footprint]) -> tuple[float, float, float]:

@@ -307,6 +307,7 @@ class ShotBatches:
         """Return as `at` a renderer by light maps, which has sea heights instead of a mesh."""
         lidar, sea = renderer.scene, self._seas[0]
         heights, corners = self._heights(sea, shots)
+        values = aligned(mi.Float, heights)
         places = shots.places - self._frame_origin
         parts = [(scene, at) for scene, at in ((self._going, None), (self._fixed, places)) if scene is not None]
 
@@ -324,7 +325,7 @@ class ShotBatches:
                 receiver_poses=all_shots.receiver,
                 transmitter_poses=all_shots.transmitter,
             )
-            fields = HeightFields.of_patches(heights, corners, sea.cell_size, sea.wind_direction, waves, copies)
+            fields = HeightFields.of_patches(values, corners, sea.cell_size, sea.wind_direction, waves, copies)
             return renderer.over(placed, fields)
 
         return renderer_of

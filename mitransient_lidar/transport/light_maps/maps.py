@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Self
 
@@ -38,7 +39,7 @@ class HeightFields:
     @classmethod
     def of_patches(
         cls,
-        heights: FloatArray,
+        values: mi.Float,
         corners: FloatArray,
         cell: float,
         wind_direction: float,
@@ -49,8 +50,8 @@ class HeightFields:
 
         Parameters
         ----------
-        heights, corners
-            As in `physics.sea.sea_surface.SeaSurface.height_patches`, in the shapes' frame.
+        values, corners
+            As in `physics.sea.sea_surface.SeaSurface.height_patches`, in the shapes\' frame.
         cell
             Side of a cell [m].
         wind_direction
@@ -60,12 +61,12 @@ class HeightFields:
         copies
             Shots in turn that share a patch.
         """
-        shots, lines, _ = heights.shape
+        shots = len(corners)
+        lines = math.isqrt(dr.width(values) // shots)
         low = mi.Vector2f(
             *(aligned(mi.Float, column.astype(np.float32)) for column in np.repeat(corners, copies, axis=0).T)
         )
         wind = opaque(float(np.cos(wind_direction))), opaque(float(np.sin(wind_direction)))
-        values = aligned(mi.Float, heights.astype(np.float32))
         sizes = opaque_index(lines), opaque(1 / cell)
         turn = mi.Vector2f(1, 0) if part.turn is None else part.turn
         return cls(values, *sizes, wind, low, part.displacement, turn, starts(shots, lines * lines, copies))
@@ -75,10 +76,10 @@ class HeightFields:
         """Return the field about the place of a scene's own shot, or a level sea's there."""
         (sea,), pose = scene.seas, scene.receiver.pose
         place = pose.in_scene(pose.ground_point())[None, :2]
-        heights, corners = sea.sea.height_patches(place, sea.footprint_size, [sea.sea])
-        heights = np.zeros((1, 3, 3)) if level else heights
+        level_sea = np.zeros((1, 3, 3)), place
+        heights, corners = level_sea if level else sea.sea.height_patches(place, sea.met_size, [sea.sea])
         part = ScenePart(scene.mitsuba_scene, opaque_vector(scene.frame_origin))
-        return cls.of_patches(heights, corners, sea.sea.line_distance, sea.sea.wind_direction, part)
+        return cls.of_patches(aligned(mi.Float, heights), corners, sea.sea.line_distance, sea.sea.wind_direction, part)
 
     def meet(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """Return where rays that go down meet the sea, on the faces that its mesh has; `active` in valid ones."""

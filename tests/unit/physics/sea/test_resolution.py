@@ -97,8 +97,10 @@ def test_own_values_of_the_sea_win():
     # Without a lidar in the scene the same values describe one.
     assert choose([], **own) == expected
     explicit = {"cell_size": 0.3, "refined_size": 20.0, "centre_x": 3.0, "centre_y": -2.0, "size": 400.0}
-    assert choose(lidar(), shortest_wave=0.5, **explicit) == Resolution((3.0, -2.0), 0.3, 20.0, 400.0, 0.5, 0.5)
-    assert choose([]) == Resolution((0.0, 0.0), 0.125, 32.0, 1000.0, 1.0, 1.0)
+    side = 1.25 * 2 * max(each.half_side for each in lidar())
+    found = choose(lidar(), shortest_wave=0.5, **explicit)
+    assert found == Resolution((3.0, -2.0), 0.3, 20.0, 400.0, 0.5, 0.5, side)
+    assert choose([]) == Resolution((0.0, 0.0), 0.125, 32.0, 1000.0, 1.0, 1.0, 24.0)
 
 
 def test_waves_that_no_cell_resolves_become_ripples():
