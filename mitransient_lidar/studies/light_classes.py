@@ -77,7 +77,7 @@ def estimate(
     Raises
     ------
     UserError
-        If the scene is invalid, or not one that light maps are for (`transport.light_maps.renderer.unsuited`); if a
+        If the scene is invalid, or not one that light maps are for (`transport.light_maps.suitability.unsuited`); if a
         number is out of range.
 
     Notes
