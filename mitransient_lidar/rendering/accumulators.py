@@ -41,7 +41,7 @@ _BYTES_PER_KEPT_BIN = 96
 _BYTES_PER_PASSING_BIN, _BYTES_PER_KEPT_GATE, _BYTES_PER_DIRECT_GATE, _BYTES_PER_SMOOTHED_GATE = 8, 64, 18, 24
 #: Memory of the program, and its means and errors per pixel, and per gate that is summed directly, in all passes and
 #: when it is written, for images.
-_PROGRAM, _BYTES_PER_PIXEL, _BYTES_OF_MEANS, _BYTES_PER_WRITTEN_GATE = 0.31e9, 260.0, 16, 4
+_PROGRAM, _BYTES_PER_PIXEL, _BYTES_OF_MEANS, _BYTES_PER_WRITTEN_GATE = 0.31e9, 260.0, 16, 6
 #: Most tiles of an image.
 _MOST_TILES = 64
 #: Memory per bin in a batch of passes: its sum, and the mean in the result.
