@@ -102,6 +102,9 @@ def write_page(page: View, path: Path | None) -> Path:
         return page.save(path)
 
 
+#: Gate stacks that are drawn, and written to EXR files, in single precision [bytes].
+_LARGE = 2**28
+
 #: Largest size of a page [MB].
 PAGE_MB = 200.0
 
@@ -151,6 +154,8 @@ class GateFiles:
         from mitransient_lidar.results.gate_stack import as_stack, check_stack, has_frames
 
         frames = has_frames(stack)
+        if not frames and stack.nbytes > _LARGE:
+            _make_single(stack)
         drawn = as_stack(stack)
         for path in self.names():
             if path.suffix in (".gif", ".mp4"):
@@ -174,6 +179,18 @@ class GateFiles:
                 results.save(stack, self.folder / f"{self.stem}.png")
             if "sequence" in self.wanted:
                 exr.write_sequence(drawn if frames else check_stack(stack), self.folder, self.stem)
+
+
+def _make_single(stack: xr.Dataset) -> None:
+    """Change the energies of a stack to single precision, as EXR files have them, gate by gate in the file's order."""
+    import numpy as np
+
+    for name in ("gate_energy", "gate_energy_stderr"):
+        dims, values = stack[name].dims, np.moveaxis(stack[name].values, -1, 0)
+        images = np.empty(values.shape, np.float32)
+        for image, own in zip(images, values, strict=True):
+            image[...] = own
+        stack[name] = (dims, np.moveaxis(images, 0, -1), stack[name].attrs)
 
 
 def _draw_depths(stack: xr.Dataset, path: Path, quiet: bool) -> None:

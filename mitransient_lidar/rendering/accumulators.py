@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -38,6 +39,11 @@ logger = logging.getLogger(__name__)
 _BYTES_PER_KEPT_BIN = 96
 #: Memory per bin when a pass is converted to gates, per gate kept then, and per gate summed directly.
 _BYTES_PER_PASSING_BIN, _BYTES_PER_KEPT_GATE, _BYTES_PER_DIRECT_GATE, _BYTES_PER_SMOOTHED_GATE = 8, 64, 18, 24
+#: Memory of the program, and its means and errors per pixel, and per gate that is summed directly, in all passes and
+#: when it is written, for images.
+_PROGRAM, _BYTES_PER_PIXEL, _BYTES_OF_MEANS, _BYTES_PER_WRITTEN_GATE = 0.31e9, 260.0, 16, 6
+#: Most tiles of an image.
+_MOST_TILES = 64
 #: Memory per bin in a batch of passes: its sum, and the mean in the result.
 _BYTES_PER_BATCH = 16
 
@@ -46,6 +52,9 @@ _ERROR_PIXELS = 4096
 
 #: Smallest path share in a pass with smoothed images: with fewer, paths take little of the time.
 _LEAST_SHARE_OF_SMOOTH = 2**-3
+
+#: Values that are summed at a time.
+_SUMMED = 2**23
 
 #: A pixel is lit in a gate with this share of the energy in the gate's brightest pixels (99th percentile).
 _LIT = 0.05
@@ -112,7 +121,9 @@ class PassAccumulator:
     smooth
         Standard deviation by which each gate's image is smoothed [pixels], or None.
     size
-        Memory for film, means and errors [bytes], 0 if it is unknown.
+        Memory of film, means and errors, for images of the whole render [bytes]; 0 if it is unknown.
+    tiles
+        Tiles of pixels whose ``direct`` gates are accumulated in turn in each pass, or one None for all pixels.
     """
 
     def __init__(
@@ -127,6 +138,7 @@ class PassAccumulator:
         kept: Literal["histograms", "gates", "direct"] = "histograms",
         smooth: float | None = None,
         size: float = 0.0,
+        tiles: Sequence[range | None] = (None,),
     ) -> None:
         self.scene, self.window, self.train, self._kept, self._smooth = scene, window, train, kept, smooth
         self._light, self._correlation = Light(scene, bool(origins)), ErrorCorrelation()
@@ -135,7 +147,7 @@ class PassAccumulator:
         self._differences = differences
         self._batches: list[FloatArray] = [np.zeros(())] * batches  # power sums of every batch
         self.gates, self._gate_slopes = PassStatistics(), PassStatistics()
-        self.size = size
+        self.size, self.tiles = size, tiles
         #: Gates that a pass accumulates instead of time bins, or None.
         self.gate_weights: GateWeights | None = None
         self._weights: FloatArray | None = None
@@ -161,16 +173,21 @@ class PassAccumulator:
     @property
     def received(self) -> float:
         """Energy received in all passes, or in their gates [J]."""
-        return float(np.nansum(self._received.mean)) * self._received.count
+        mean = self._received.mean
+        # In parts, of which each is copied.
+        parts = np.array_split(mean, max(mean.size // _SUMMED, 1)) if mean.ndim else [mean]
+        return float(sum(np.nansum(part) for part in parts)) * self._received.count
 
-    def add(self, histogram: TransientHistogram, gated: TransientHistogram | None = None) -> None:
-        """Add a pass histogram, and its gates if they were accumulated beside it."""
+    def add(
+        self, histogram: TransientHistogram, gated: TransientHistogram | None = None, tile: range | None = None
+    ) -> None:
+        """Add a pass histogram, of all pixels or of one tile after the other, and its gates accumulated beside it."""
         pixels, classes = self.scene.receiver.pixels.count, max(len(self._origins), 1)
         if self._kept == "direct" and self._smooth:
             self.gates.add(self._smoothed(histogram.energy().reshape(pixels, -1)))
             return
         if self._kept == "direct":
-            self.gates.add_parts((pixels, histogram.record_length), histogram.energy_of)
+            self.gates.add_parts((pixels, histogram.record_length), histogram.energy_of, tile)
             return
         if self._kept == "gates":
             assert self._weights is not None
@@ -286,12 +303,12 @@ class PassAccumulator:
         assert self.train is not None
         pixels = self.scene.receiver.pixels
         shape = (*(pixels.grid or (pixels.count,)), self.train.count)
-        mean, stderr = (values.reshape(shape) for values in (self.gates.mean, self.gates.stderr))
+        # A coordinate, which all files hold.
+        bias = {"gate_smoothing_bias": ("gate", self._smoothing_bias())} if self._smooth else {}
+        mean, stderr = (values.reshape(shape) for values in (self.gates.mean, self.gates.pop_stderr()))
         if invalid := np.count_nonzero(~np.isfinite(mean).all(axis=-1)):
             logger.warning("gates of %d of %d pixels hold values that are not finite", invalid, mean[..., 0].size)
         stack = build_gates(mean, stderr, self.train, coords=coords, attributes=attributes)
-        # A coordinate, which all files hold.
-        bias = {"gate_smoothing_bias": ("gate", self._smoothing_bias())} if self._smooth else {}
         return label(stack.assign_coords(bias))
 
     def _joined(self, of_paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> list[FloatArray]:
@@ -317,8 +334,12 @@ def choose_accumulator(
     differences: Differences | None = None,
     batches: int = 0,
     smooth: float | None = None,
+    of_pass: tuple[float, float] = (0.0, 0.0),
 ) -> PassAccumulator:
     """Return the accumulator for the most quantities whose film, means and errors fit in `max_memory` [GB].
+
+    For images, program, paths (`of_pass`, as of `PassRenderer.memory`) and files count, too. Where direct gates exceed
+    the memory, each pass accumulates tiles of pixels in turn.
 
     Gate depths are relative to the surface echo's mean time [ns], None without one. Light is separated by `origins`,
     and differentiated by `parameters`, some by `differences`, if there are any. The power in `batches` pass batches is
@@ -328,7 +349,10 @@ def choose_accumulator(
     gate exceeds the memory, or gates by depth have no surface.
     """
     pixels, per_bin = scene.receiver.pixels.count, TransientHistogram.BYTES_PER_BIN
-    each, limit = pixels * scene.axis.bin_count, 1e9 * max_memory
+    is_image = scene.receiver.is_imager and not smooth
+    program = _PROGRAM + _BYTES_PER_PIXEL * pixels if is_image else 0.0
+    beside = program + of_pass[0] + of_pass[1] * pixels if is_image else 0.0
+    each, limit = pixels * scene.axis.bin_count, 1e9 * max_memory - beside
     channels = 1 + len(parameters)
     bins = each * (1 + len(origins)) * channels
     train = placed_gates(scene, surface_time_ns, float(window.start_ns.min()))
@@ -339,7 +363,7 @@ def choose_accumulator(
     if everything <= limit and not smooth:
         require_memory(f"histograms of {pixels} pixels x {scene.axis.bin_count} bins", everything, "take fewer of them")
         kept = origins, parameters, differences, batches
-        return PassAccumulator(scene, window, train, *kept, size=everything)
+        return PassAccumulator(scene, window, train, *kept, size=everything + beside)
     cure = "take fewer of them"
     if origins:
         of_what, cure = f" x {len(origins)} components", "take fewer bins or pixels"
@@ -349,15 +373,20 @@ def choose_accumulator(
         of_what = f" x {channels} with derivatives"
     else:
         of_what, cure = "", "take fewer bins or pixels, or gates (gate_count), which do not need it"
-    size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins{of_what} takes {1e-9 * everything:.2g} GB"
+    taken = f"{1e-9 * (everything + beside):.2g} GB"
+    size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins{of_what} takes {taken}"
     if of_what or train is None:
         raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; {cure}")
     is_narrow = train.width_ns < scene.axis.bin_width_ns
     if film_bytes + _BYTES_PER_PASSING_BIN * bins + gates <= limit and not is_narrow:
         if not smooth:
             logger.warning("%s, more than max_memory = %g GB: gates are kept, histograms are not", size, max_memory)
-        size_of_gates = film_bytes + _BYTES_PER_PASSING_BIN * bins + gates
+        size_of_gates = film_bytes + _BYTES_PER_PASSING_BIN * bins + gates + beside
         return PassAccumulator(scene, window, train, kept="gates", smooth=smooth, size=size_of_gates)
+    if is_image:
+        logger.warning("%s, more than max_memory = %g GB: gates are summed directly", size, max_memory)
+        needed, tiles = _tiles(pixels, train.count, program, of_pass, max_memory)
+        return PassAccumulator(scene, window, train, kept="direct", size=needed, tiles=tiles)
     each = (per_bin + _BYTES_PER_DIRECT_GATE + (_BYTES_PER_SMOOTHED_GATE if smooth else 0)) * pixels
     if each * train.count > limit:
         fitting = int(limit // each)
@@ -369,6 +398,28 @@ def choose_accumulator(
     if not smooth:
         logger.warning("%s, more than max_memory = %g GB: gates are summed directly", size, max_memory)
     return PassAccumulator(scene, window, train, kept="direct", smooth=smooth, size=each * train.count)
+
+
+def _tiles(
+    pixels: int, gates: int, program: float, of_pass: tuple[float, float], max_memory: float
+) -> tuple[float, list[range | None]]:
+    """Return the memory of an image's render and its files [bytes], and the tiles of pixels in its passes.
+
+    Raises UserError if means, errors and small tiles exceed `max_memory` [GB].
+    """
+    kept = program + _BYTES_OF_MEANS * pixels * gates
+    passing, per_pixel = kept + of_pass[0], of_pass[1] + TransientHistogram.BYTES_PER_BIN * gates
+    written, limit = kept + _BYTES_PER_WRITTEN_GATE * pixels * gates, 1e9 * max_memory
+    most = int(min((limit - passing) // per_pixel, pixels))
+    least = max(passing + per_pixel * pixels / _MOST_TILES, written)
+    if least > limit:
+        raise UserError(
+            f"max_memory = {max_memory:g} GB is less than {gates} gates of {pixels} pixels take with the program, "
+            f"{1e-9 * least:.3g} GB: allow that much, or take fewer gates or pixels"
+        )
+    size = math.ceil(pixels / math.ceil(pixels / most))
+    tiles: list[range | None] = [range(first, min(first + size, pixels)) for first in range(0, pixels, size)]
+    return max(passing + per_pixel * size, written), tiles if len(tiles) > 1 else [None]
 
 
 def share_of_pass(smooth: float) -> float:

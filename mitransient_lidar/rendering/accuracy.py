@@ -44,18 +44,23 @@ class PassStatistics:
         """Add one pass."""
         self.add_parts(np.shape(values), lambda part: values[part])
 
-    def add_parts(self, shape: tuple[int, ...], part_of: Callable[[Any], FloatArray]) -> None:
+    def add_parts(
+        self, shape: tuple[int, ...], part_of: Callable[[Any], FloatArray], rows: range | None = None
+    ) -> None:
         """Add one pass in a shape, given a function that returns parts of the first axis.
 
-        Parts fit the processor's cache, and no further arrays of the whole shape exist.
+        Parts fit the processor's cache, and no further arrays of the whole shape exist. With `rows`, of which all
+        follow in order, the function returns parts of these.
         """
         if self.count == 0:
             self.mean, self._squares = np.zeros(shape), np.zeros(shape)
-        self.count += 1
+        rows = range(shape[0] if shape else 1) if rows is None else rows
+        self.count += rows.start == 0
         step = max(_PART // max(int(np.prod(shape[1:])), 1), 1)
-        for start in range(0, shape[0], step) if shape else [0]:
-            part = slice(start, start + step) if shape else ()
-            values = part_of(part)
+        for start in rows[::step]:
+            end = min(start + step, rows.stop)
+            part, own = (slice(start - low, end - low) if shape else () for low in (0, rows.start))
+            values = part_of(own)
             deviation = values - self.mean[part]
             self.mean[part] += deviation / self.count
             self._squares[part] += deviation * (values - self.mean[part])
@@ -64,6 +69,14 @@ class PassStatistics:
     def stderr(self) -> FloatArray:
         """Standard error of the mean; NaN before the second pass."""
         return self.stderr_of(slice(None))
+
+    def pop_stderr(self) -> FloatArray:
+        """Return the standard error of the mean in the memory of the statistics, which have none afterwards."""
+        found, self._squares = self._squares, np.zeros(())
+        if self.count < 2:
+            return np.full_like(found, np.nan)
+        np.divide(found, self.count - 1, out=found)
+        return np.sqrt(np.divide(found, self.count, out=found), out=found)
 
     def stderr_of(self, part: slice) -> FloatArray:
         """Return the mean's standard error for part of the first axis; NaN before the second pass."""

@@ -92,11 +92,11 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
     else:
         if kind == "render" and "batches" in attributes:
             own["batches"] = attributes["batches"]
-        if kind == "render" and "light" in attributes:
-            own["light"] = attributes["light"]
         own["components"] = bool(attributes.get("components", 0))
         if "derivatives" in attributes:
             own["derivatives"] = np.atleast_1d(attributes["derivatives"]).tolist()
+    if kind in ("render", "frames") and "light" in attributes:
+        own["light"] = attributes["light"]
     if "smooth_pixels" in attributes:
         own["smooth"] = attributes["smooth_pixels"]
     if any(name in given for name in _ENDS):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -28,7 +29,13 @@ _PATHS_PER_THREAD, _PATHS_ON_GPU = 2**14, 2**17
 
 
 def fit_to_time(
-    renderer: PassRenderer, max_time: float, start_ns: float, *, seed: int, gates: GateWeights | None
+    renderer: PassRenderer,
+    max_time: float,
+    start_ns: float,
+    *,
+    seed: int,
+    gates: GateWeights | None,
+    tiles: Sequence[range | None] = (None,),
 ) -> tuple[PassRenderer, float, ReceivedLight | None]:
     """Return a renderer whose passes fit into a time limit, with fewer paths where full passes do not.
 
@@ -37,7 +44,8 @@ def fit_to_time(
     work besides the kernels takes longer.
 
     `renderer`: renderer for full passes. `max_time`: time limit for the render [s]. `start_ns`: time at which light
-    enters the water [ns]. `seed`, `gates`: arguments of `PassRenderer.render_pass` for the first pass.
+    enters the water [ns]. `seed`, `gates`: arguments of `PassRenderer.render_pass` for the first pass. `tiles`: tiles
+    of pixels in each pass, or None for all.
 
     Returns
     -------
@@ -46,17 +54,17 @@ def fit_to_time(
     share
         Its share of a full pass's paths.
     first
-        Record of the first pass, if it is rendered already.
+        Record of the first pass, if it is rendered already, without tiles.
     """
     paths = renderer.path_count
     if paths * _rays_per_path(renderer.scene, start_ns) < 2 * max_time * _RAYS_PER_SECOND:
         return renderer, 1.0, None
     began = time.perf_counter()
     trial = renderer.scaled(SMALLEST_SHARE)
-    received, kernels, rest = timed_pass(trial, seed, gates)
+    received, kernels, rest = timed_pass(trial, seed, gates, tiles)
     if _SMALL_PASSES * kernels < max_time:
         # Without buffer growth and kernel compilation, which belong to the first trial.
-        received, kernels, rest = timed_pass(trial, seed, gates)
+        received, kernels, rest = timed_pass(trial, seed, gates, tiles)
     left = max_time - (time.perf_counter() - began)
 
     def kernels_of(share: float) -> float:
@@ -71,12 +79,12 @@ def fit_to_time(
     return (renderer.scaled(share), share, None) if share > SMALLEST_SHARE else (trial, share, received)
 
 
-def describe_cost(renderer: PassRenderer, size: float, start_ns: float) -> str:
-    """Return a line with the memory for film, means and errors [bytes], and a pass's longest time on two slow cores."""
+def describe_cost(renderer: PassRenderer, size: float, start_ns: float, tiles: int = 1) -> str:
+    """Return a line with the memory of a render [bytes], and a pass's longest time on two slow cores."""
     pixels, rays = renderer.scene.receiver.pixels.count, renderer.path_count * _rays_per_path(renderer.scene, start_ns)
     return (
-        f"{pixels} pixels: film, means and errors take {1e-9 * size:.2g} GB, and a pass of {renderer.path_count} paths "
-        f"at most about {rays / _RAYS_PER_SECOND:.2g} s on two cores"
+        f"{pixels} pixels{f' in {tiles} tiles' if tiles > 1 else ''}: the render takes {1e-9 * size:.3g} GB with the "
+        f"program, and a pass of {renderer.path_count} paths at most about {rays / _RAYS_PER_SECOND:.2g} s on two cores"
     )
 
 
@@ -90,18 +98,25 @@ def _rays_per_path(scene: LidarScene, start_ns: float) -> float:
     return 2.0 + scattering * length
 
 
-def timed_pass(renderer: PassRenderer, seed: int, gates: GateWeights | None) -> tuple[ReceivedLight, float, float]:
-    """Render a pass; return it, its kernels' time, and the other time except for their compilation [s]."""
+def timed_pass(
+    renderer: PassRenderer, seed: int, gates: GateWeights | None, tiles: Sequence[range | None]
+) -> tuple[ReceivedLight | None, float, float]:
+    """Render a pass; return it, the time of its kernels, and the other time except for their compilation [s].
+
+    A pass in `tiles` is not kept.
+    """
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         began = time.perf_counter()
-        received = renderer.render_pass(seed, gates=gates)
+        for tile in tiles:
+            received: ReceivedLight | None = None  # without two tiles at once
+            received = renderer.render_pass(seed, gates=gates, tile=tile)
         dr.sync_thread()
         total = time.perf_counter() - began
         history = dr.kernel_history()
     kernels = 1e-3 * sum(kernel["execution_time"] for kernel in history)
     compilation = 1e-3 * sum(kernel.get("codegen_time", 0.0) + kernel.get("backend_time", 0.0) for kernel in history)
-    return received, kernels, max(total - kernels - compilation, 0.0)
+    return received if len(tiles) == 1 else None, kernels, max(total - kernels - compilation, 0.0)
 
 
 def _at_once(paths: float) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar import results
@@ -115,7 +116,8 @@ def render(
         Integer from -2^63 to 2^63 - 1, 0 by default; the same seed gives the same result on the same machine.
     max_memory
         Memory for histograms, means and errors [GB], greater than 0; 2 by default. If a scene with gates exceeds it,
-        only the gates are kept, with a warning.
+        only the gates are kept, with a warning. For images it is the whole of the process, and passes render tiles of
+        pixels where these alone fit.
     pass_share
         Share of a full pass's paths in each pass, 1/512 to 1; by default 1, or less where `max_time` needs it.
     components
@@ -258,7 +260,16 @@ def _render(
     origins = renderer.classes.names if components else []
     surface = described.get("surface_time_ns")
     accumulator = choose_accumulator(
-        lidar, window, surface, max_memory, origins, parameters, differences, options.batches or 0, options.smooth
+        lidar,
+        window,
+        surface,
+        max_memory,
+        origins,
+        parameters,
+        differences,
+        options.batches or 0,
+        options.smooth,
+        renderer.memory,
     )
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
     default = Goal(passes=SMALLEST_PASS_COUNT) if is_level else default
@@ -266,20 +277,26 @@ def _render(
     full = renderer.for_smoothing(share_of_pass(options.smooth)) if options.smooth else renderer
     fitted = full if share == 1 else full.scaled(share)
     if lidar.receiver.is_imager:
-        logger.info("%s", describe_cost(fitted, accumulator.size, float(window.start_ns.min())))
+        cost = describe_cost(fitted, accumulator.size, float(window.start_ns.min()), len(accumulator.tiles))
+        logger.info("%s", cost)
 
     def render_pass(number: int, seed: int) -> float:
         nonlocal fitted, share
         gates, beside, first = accumulator.gate_weights, accumulator.gates_beside, None
         if number == 0 and goal.max_time is not None and options.pass_share is None:
             start_ns = float(window.start_ns.min())
-            fitted, share, first = fit_to_time(full, goal.max_time, start_ns, seed=seed, gates=gates)
+            tiles = accumulator.tiles
+            fitted, share, first = fit_to_time(full, goal.max_time, start_ns, seed=seed, gates=gates, tiles=tiles)
         received = None if beside else first
-        received = received or fitted.render_pass(seed, gates=gates, beside=beside)
-        accumulator.add(received.histogram, received.gated)
+        lost = 0.0
+        for tile in accumulator.tiles:
+            received = received or fitted.render_pass(seed, gates=gates, beside=beside, tile=tile)
+            accumulator.add(received.histogram, received.gated, tile)
+            # The loss is of all pixels.
+            lost, received = received.edge_loss, None
         if differences is not None:
             differences.add_pass(seed, share)
-        return received.edge_loss
+        return lost
 
     log = run_passes(
         render_pass,
@@ -290,6 +307,8 @@ def _render(
         verify=accumulator.require_light,
         progress=progress,
     )
+    if lidar.receiver.is_imager:
+        dr.flush_malloc_cache()  # Dr.Jit keeps the memory of passes
     missed = renderer.probe.echoes.missed_beam
     if lidar.surfaces and missed > TOLERATED_LOSS:
         logger.warning(

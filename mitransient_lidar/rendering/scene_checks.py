@@ -13,7 +13,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.fitted_axis import NEAREST_RANGE, earliest_ns, total_reflection_ns
-from mitransient_lidar.transport.light_maps.renderer import light_faintly
+from mitransient_lidar.transport.light_maps.suitability import light_faintly
 from mitransient_lidar.transport.opaque import shape_number
 from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays, SolidEcho, gaps
 from mitransient_lidar.transport.rng import unit_points

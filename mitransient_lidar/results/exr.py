@@ -9,11 +9,12 @@
   attributes ``gateStartNs``, ``gateWidthNs`` and, if known, ``gateDepthM``, or ``timeS``. A sequence is a folder with
   one file per gate, numbered like the parts.
 
-Pixels without a grid form an image one row high. Dimensions, coordinates and attributes are written twice. OpenEXR
-supports only 32-bit integers and floats and no empty list, so a JSON string (header attribute ``mitransientLidar``)
-stores them exactly; ``exrheader`` and other programs read copied numbers and texts that most readers need. The
-attribute ``mitransientLidarSha256`` in each part is the checksum over that string and the channels: OpenEXR has none
-for its header, nor for blocks that ZIP cannot make smaller.
+Coordinates of more than 131 072 pixels are the last part, ``coordinates``, with the halves of their 64-bit numbers as
+integers (``angle_x.low``, ``angle_x.high``). Pixels without a grid form an image one row high. Dimensions, coordinates
+and attributes are written twice. OpenEXR supports only 32-bit integers and floats and no empty list, so a JSON string
+(header attribute ``mitransientLidar``) stores them exactly; ``exrheader`` and other programs read copies of the numbers
+and texts that most readers need. The attribute ``mitransientLidarSha256`` in each part is the checksum of that string
+and of the channels: OpenEXR has none for its header, nor for blocks that ZIP cannot make smaller.
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ _LONGEST_NAME = 255  # bytes; OpenEXR silently drops attributes with longer name
 #: Channels in a part: OpenImageIO reads no more, and OpenEXR needs a time that grows with their square.
 _MOST_CHANNELS = 1024
 _BYTES_PER_CHANNEL = 2500  #: Memory per channel besides its values.
+_MOST_LISTED = 2**17  #: Most values of a coordinate in the JSON string; more are channels of a part of their own.
+_COORDINATES, _HALVES = "coordinates", ("low", "high")
 _INT32 = np.iinfo(np.int32)
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
 
@@ -88,7 +91,7 @@ class Part(NamedTuple):
 
     name: str  #: Unique part name; empty in a file with one part.
     attributes: dict[str, Any]  #: The header; for writing, in types that OpenEXR stores.
-    channels: dict[str, npt.NDArray[np.float32]]  #: Channel name to values with the shape (row, column).
+    channels: dict[str, npt.NDArray[Any]]  #: Channel name to values with the shape (row, column).
 
 
 def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *, sequence: bool = False) -> list[Part]:
@@ -105,6 +108,12 @@ def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *,
     if extra := [str(name) for name in dataset.data_vars if name not in variables]:
         raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file")
     dataset = dataset.assign_attrs({str(name): attribute(str(name), value) for name, value in dataset.attrs.items()})
+    # Text of many numbers would take several times the memory.
+    large = {
+        name: one
+        for name, one in dataset.coords.items()
+        if kind is not None and not sequence and one.size > _MOST_LISTED and one.dtype == float and one.ndim == 2
+    }
     exact = {
         "content": content,
         "is_sequence": sequence,
@@ -116,7 +125,7 @@ def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *,
             str(name): {
                 "dims": list(coordinate.dims),
                 "kind": "str" if coordinate.dtype.kind in "UO" else coordinate.dtype.name,
-                "values": coordinate.values.tolist(),
+                "values": None if name in large else coordinate.values.tolist(),
                 "attributes": coordinate.attrs,
             }
             for name, coordinate in dataset.coords.items()
@@ -128,7 +137,20 @@ def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *,
     if kind is None:
         readable |= {"timeStartNs": dataset.attrs["time_start_ns"], "binWidthNs": dataset.attrs["bin_width_ns"]}
         return _layers(dataset, exact, readable)
-    return _images(dataset, exact, readable, kind)
+    channels = {name: image for one in large.values() for name, image in _halves(one).items()}
+    return _images(dataset, exact, readable, kind) + ([Part(_COORDINATES, {}, channels)] if large else [])
+
+
+def _halves(coordinate: xr.DataArray) -> dict[str, npt.NDArray[Any]]:
+    """Return the channels of a coordinate over rows and columns: both halves of its 64-bit numbers."""
+    halves = np.ascontiguousarray(coordinate.values, "<f8").view("<u4").reshape(*coordinate.shape, 2)
+    return {f"{coordinate.name}.{half}": np.ascontiguousarray(halves[..., i]) for i, half in enumerate(_HALVES)}
+
+
+def _from_halves(name: str, channels: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float64]:
+    """Return a coordinate's values from `_halves`."""
+    halves = np.stack([channels[f"{name}.{half}"].astype("<u4") for half in _HALVES], axis=-1)
+    return halves.view("<f8")[..., 0].astype(np.float64)
 
 
 def _kind(content: str, variables: Iterable[Any]) -> _Images | None:
@@ -203,7 +225,7 @@ def _images(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str
     text = json.dumps(exact)
     identity = hashlib.sha256(text.encode())
     for values in images.values():
-        identity.update(values.tobytes())
+        identity.update(values.data)
     count = stack.sizes[kind.dim]
     digits = kind.digits if count < 10**kind.digits else max(kind.digits + 1, len(str(count - 1)))
     parts = []
@@ -223,8 +245,14 @@ def _images(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str
 
 def _pictures(values: npt.NDArray[Any], axis: int) -> npt.NDArray[np.float32]:
     """Return values as contiguous images (axis, row, column); pixels without a grid are an image one row high."""
-    images = np.moveaxis(values.astype(np.float32), axis, 0)
-    return np.ascontiguousarray(images if images.ndim == 3 else images[:, np.newaxis])
+    moved = np.moveaxis(values, axis, 0)
+    if moved.dtype == np.float32 and moved.ndim == 3 and moved.flags.c_contiguous:
+        return moved
+    images = np.empty(moved.shape, np.float32)
+    # One after the other, without further arrays of the whole size.
+    for image, own in zip(images, moved, strict=True):
+        image[...] = own
+    return images if images.ndim == 3 else images[:, np.newaxis]
 
 
 def write_sequence(stack: xr.Dataset, folder: Path, stem: str) -> None:
@@ -287,6 +315,9 @@ def read(path: Path) -> xr.Dataset:
     try:
         kind = _kind(exact.get("content", ""), exact["variables"])
         images = _of_layers(path, parts) if kind is None else _of_images(path, parts, exact, kind)
+        for name, item in exact["coordinates"].items():
+            if item["values"] is None:
+                item["values"] = _from_halves(name, next(one.channels for one in parts if one.name == _COORDINATES))
         found = _labelled(images, exact)
         return found if exact["content"] != "frames" else _joined_frames(found, exact["types"])
     except UserError:
@@ -314,8 +345,8 @@ def _of_layers(path: Path, parts: Sequence[Part]) -> dict[str, npt.NDArray[Any]]
 def _of_images(
     path: Path, parts: list[Part], exact: Mapping[str, Any], kind: _Images
 ) -> dict[str, npt.NDArray[np.float32]]:
-    """Return variables' values with one part per image, (..., row, column) with the parts' dimension."""
-    along = kind.dim in exact["dims"]
+    """Return the values of variables with one part per image, (..., row, column) with the dimension of the parts."""
+    along, parts = kind.dim in exact["dims"], [part for part in parts if part.name != _COORDINATES]
     count = len(exact["coordinates"][next(iter(kind.header))]["values"]) if along else 1
     if exact["is_sequence"] and count > 1:
         parts = parts + _later_files(path, count)

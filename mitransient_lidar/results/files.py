@@ -41,6 +41,9 @@ SIGNATURE, _CHECKSUM = b"\x89HDF\r\n\x1a\n", b"mitransient-lidar sha256 "
 #: Attribute with the JSON of those that are not file attributes.
 OTHERS = "mitransient_lidar"
 
+#: Datasets that are written to the disk directly [bytes], and reserved space over their size.
+_LARGE, _RESERVED = 2**28, 1.1
+
 _SMALL = 4096  # bytes of a variable that is not worth compressing
 _ROUNDING = 1e-2  # of a converter step, by which a signal may differ from a code
 
@@ -48,24 +51,32 @@ _ROUNDING = 1e-2  # of a converter step, by which a signal may differ from a cod
 def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a dataset to a NetCDF-4 file; an existing one is overwritten.
 
-    It goes by way of memory, because HDF5 ends the process where the disk is full. Signals behind a converter are
-    written as its codes. Raises `ValueError` if an attribute is no number, text or list with one such type. Raises
-    `OSError` if the file cannot be written.
+    HDF5 ends the process where the disk is full: files go by way of memory, and the disk space of large ones is
+    reserved first. Signals behind a converter are written as its codes. Raises `ValueError` if an attribute is no
+    number, text or list of one of these. Raises `OSError` if the file cannot be written.
     """
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
     green, infrared = split(dataset)
-    buffer = io.BytesIO()
-    with h5netcdf.File(buffer, "w") as file:
-        for group, one in ((file, green), (INFRARED, infrared)):
-            if one is not None:
-                own = file.create_group(group) if isinstance(group, str) else group
-                stored, encoding = _stored(one)
-                stored.dump_to_store(H5NetCDFStore(own), encoding=encoding)
-    with Path(path).open("wb") as output:
-        output.write(buffer.getbuffer())
-        output.write(_CHECKSUM + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
+    is_large = dataset.nbytes > _LARGE
+    with Path(path).open("w+b") as output:
+        buffer = output if is_large else io.BytesIO()
+        with h5netcdf.File(buffer, "w") as file:
+            if is_large:  # HDF5 cuts the file to its length
+                os.posix_fallocate(output.fileno(), 0, round(_RESERVED * dataset.nbytes))
+            for group, one in ((file, green), (INFRARED, infrared)):
+                if one is not None:
+                    own = file.create_group(group) if isinstance(group, str) else group
+                    stored, encoding = _stored(one)
+                    stored.dump_to_store(H5NetCDFStore(own), encoding=encoding)
+        if not isinstance(buffer, io.BytesIO):
+            output.seek(0)
+            checksum = hashlib.file_digest(output, "sha256")
+        else:
+            checksum = hashlib.sha256(buffer.getbuffer())
+            output.write(buffer.getbuffer())
+        output.write(_CHECKSUM + checksum.hexdigest().encode())
 
 
 def _stored(dataset: xr.Dataset) -> tuple[xr.Dataset, dict[str, dict[str, Any]]]:

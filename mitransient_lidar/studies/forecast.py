@@ -65,7 +65,7 @@ from mitransient_lidar.studies.depth_bias import (
     SeaSeed,
     rms_slopes,
 )
-from mitransient_lidar.transport.light_maps.renderer import reach_of_scattering
+from mitransient_lidar.transport.light_maps.suitability import reach_of_scattering
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 #: Largest ratio of neighbouring depths in tables, and where the share of found bottoms falls; that of waters.

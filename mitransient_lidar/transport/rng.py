@@ -75,7 +75,7 @@ class Shots:
 
     def __init__(self, seeds: Sequence[int]) -> None:
         self.count = len(seeds)
-        self._seeds = [int(seed) for seed in seeds]
+        self.seeds = [int(seed) for seed in seeds]
 
     def paths(self, per_shot: int) -> Lanes:
         """Return the lanes for `per_shot` paths in each shot."""
@@ -83,7 +83,7 @@ class Shots:
 
     def streams(self, purpose: int, lanes: Lanes) -> mi.PCG32:
         """Return independent random number generators for stage number `purpose` in a pass."""
-        words = [np.random.SeedSequence([seed, purpose]).generate_state(2, np.uint64) for seed in self._seeds]
+        words = [np.random.SeedSequence([seed, purpose]).generate_state(2, np.uint64) for seed in self.seeds]
         # Arrays, so that all seeds share a kernel.
         state, stream = (lanes.pick(aligned(mi.UInt64, word)) for word in np.array(words).T)
         # Neighbouring streams of PCG32 are correlated unless their states are scrambled (TEA, Zafar et al. 2010).
@@ -93,12 +93,12 @@ class Shots:
 
     def uniform(self, purpose: int, count: int) -> list[mi.Float]:
         """Return `count` arrays of uniform random numbers, one number a shot."""
-        drawn = [np.random.default_rng([seed, purpose]).random(count, np.float32) for seed in self._seeds]
+        drawn = [np.random.default_rng([seed, purpose]).random(count, np.float32) for seed in self.seeds]
         return [aligned(mi.Float, column) for column in np.array(drawn).T]
 
     def keys(self, lanes: Lanes) -> mi.UInt32:
         """Return 32 bits from the seeds."""
-        bits = np.array([seed & 0xFFFFFFFF for seed in self._seeds], np.uint32)
+        bits = np.array([seed & 0xFFFFFFFF for seed in self.seeds], np.uint32)
         return lanes.pick(aligned(mi.UInt32, bits))
 
 

@@ -145,3 +145,29 @@ def test_frames_beyond_the_memory_are_refused_before_the_render():
         mitransient_lidar.render_frames("table1")
     with pytest.raises(UserError, match="gate_order = 'last' must be one of in_order, interleaved, random"):
         mitransient_lidar.render_frames("gated_mine", gate_order="last")
+
+
+@pytest.mark.slow
+def test_frames_by_light_maps_have_the_light_of_merging():
+    """Two frames 4 s apart: the caustics of the other frame differ by more than the errors."""
+    scene = {
+        **GATES,
+        **SEA,
+        "layout": "16x16",
+        "field_of_view_shape": "square",
+        "gate_start_depth": 1.0,
+        "gate_count": 2,
+    }
+    merged, mapped = (
+        mitransient_lidar.render_frames("table1", scene, light=light, frames=2, passes=8, pulse_rate_hz=0.5)
+        for light in ("merging", "maps")
+    )
+    assert mapped.attrs["light"] == "maps"
+    found, limit = largest_difference(mapped, merged, 8)
+    assert found < limit
+    own, other = (each["gate_energy"].values for each in (mapped, merged))
+    same, apart = (np.corrcoef(own[0].ravel(), other[frame].ravel())[0, 1] for frame in (0, 1))
+    assert 1 - same < 0.3 * (1 - apart)
+    np.testing.assert_array_equal(mitransient_lidar.render(mapped)["gate_energy"], mapped["gate_energy"])
+    with pytest.raises(UserError, match="light = 'paths' must be one of merging, maps"):
+        mitransient_lidar.render_frames("gated_mine", light="paths")

@@ -15,6 +15,7 @@ from mitransient_lidar.analysis.gates import cut as gating
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.rendering import accumulators
 from mitransient_lidar.results import gate_stack
 from mitransient_lidar.transport.paths.histogram import TransientHistogram
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -209,3 +210,30 @@ def test_smoothed_images_are_those_of_other_passes_smoothed(lidar_scene):
         render(lidar_scene(), smooth=2.0)
     with pytest.raises(UserError, match="smooth = 2 keeps gates alone: leave out components"):
         render(scene, smooth=2.0, batches=4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", ["maps", "merging"])
+def test_tiles_of_pixels_have_the_bits_of_the_whole_image(monkeypatch, light):
+    """Rays of another tile, or another tile's random numbers, would change most pixels."""
+    params = {"layout": "64x64", "gate_start_ns": 1425, "gate_width_ns": 8, "gate_step_ns": 5, "gate_count": 8}
+    found = []
+    for tiles in ([None], [range(1500), range(1500, 2100), range(2100, 4096)]):
+        monkeypatch.setattr(accumulators, "_tiles", lambda *_, tiles=tiles: (0.0, tiles))
+        result = mitransient_lidar.render("fig09_2x2", params, light=light, passes=2, seed=3, max_memory=0.1)
+        assert (result["gate_energy_stderr"] > 0).any("gate").mean() > 0.7
+        found.append([result[name].values for name in ("gate_energy", "gate_energy_stderr")])
+    np.testing.assert_array_equal(*found)
+
+
+def test_tiles_fit_the_memory_that_is_stated():
+    """An image of 10^6 pixels and 40 gates: its means and errors take 0.64 GB, and sums of all pixels 0.8 GB."""
+    pixels, of_pass = 10**6, (5e7, 200.0)
+    for max_memory, fewest in ((2.5, 1), (1.5, 2), (1.2, 5)):
+        size, tiles = accumulators._tiles(pixels, 40, 3e8, of_pass, max_memory)
+        assert 0.7 * max_memory < 1e-9 * size <= max_memory
+        assert len(tiles) >= fewest
+        whole = range(pixels)
+        assert [pixel for tile in tiles for pixel in tile or whole] == list(whole)
+    with pytest.raises(UserError, match=r"max_memory = 1 GB is less than 40 gates of 1000000 pixels take .*, 1\.1 GB"):
+        accumulators._tiles(pixels, 40, 3e8, of_pass, 1.0)

@@ -37,12 +37,14 @@ def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_
     if depths is None:
         raise UserError("the stack has no gate_depth, since the time of its surface echo is unknown")
     used = ~reached_by_surface(stack) if from_depth is None else depths >= from_depth
-    count = np.count_nonzero(used)
+    count = int(np.count_nonzero(used))
     if count < 3:
         place = "below the surface echo" if from_depth is None else f"below from_depth = {from_depth:g} m"
         raise UserError(f"{count} of {depths.size} gates lie {place}, but a drawing of depths needs at least 3")
-    stack, depths = stack.isel(gate=used), depths[used]
-    given = dataset.isel(gate=used) if has_frames(dataset) else stack
+    # The last gates, as a view.
+    last = slice(depths.size - count, None)
+    stack, depths = stack.isel(gate=last), depths[last]
+    given = dataset.isel(gate=last) if has_frames(dataset) else stack
     found = depth_image(given, reach=_reach(stack))
     (_draw_pixel_depths if "pixel" in stack.dims else _draw_depth_image)(figure, stack, found)
     text = f"depth of the strongest echo, gates at {depths.min():.2f} to {depths.max():.2f} m on the axis"

@@ -145,16 +145,18 @@ def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
     end at the value that the 99th percentile exceeds in one gate of ten.
     """
     energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
-    finite = np.where(np.isfinite(energy), energy, 0.0)
-    bright = np.percentile(finite, _BRIGHT, axis=(0, 1))
+    # One gate after the other, since copies of large stacks take as much memory as they do.
+    gates = [energy[..., gate] for gate in range(energy.shape[-1])]
+    bright = np.array([np.percentile(np.where(np.isfinite(image), image, 0.0), _BRIGHT) for image in gates])
     below = ~reached_by_surface(stack)
     if "surface_time_ns" not in stack.attrs:
         top = float(np.percentile(bright, 90))
     else:
         top = float(bright[below].max() if below.any() else bright.max())
     if top <= 0:
-        top = float(finite.max()) if finite.max() > 0 else 1.0
-    brighter = np.count_nonzero(finite > top) / finite.size
+        highest = max(float(image[np.isfinite(image)].max(initial=0.0)) for image in gates)
+        top = highest if highest > 0 else 1.0
+    brighter = sum(np.count_nonzero(np.isfinite(image) & (image > top)) for image in gates) / energy.size
     factor, unit = unit_of(stack, top)
     label = (
         f"{stack['gate_energy'].attrs.get('long_name', 'energy in the gate')} ({unit}{', logarithmic' if log else ''})"
@@ -164,7 +166,7 @@ def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
         label += f"; {100 * brighter:.2g} % of the values{surface} are brighter"
     if not log:
         return ColourScale(factor, unit, Normalize(0.0, top / factor), label, "max" if brighter else "neither")
-    significant = finite[(finite > SIGNIFICANT * stderr) & (finite > 0)]
+    significant = energy[np.isfinite(energy) & (energy > SIGNIFICANT * stderr) & (energy > 0)]
     bottom = max(top * 10.0**-_DECADES, float(np.percentile(significant, 1)) if significant.size else 0.0)
     # Clipped, so that values of 0 and below are dark and not missing.
     norm = LogNorm(min(bottom, 0.5 * top) / factor, top / factor, clip=True)

@@ -20,9 +20,9 @@ from mitransient_lidar.rendering.accumulators import Light
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
 from mitransient_lidar.transport.light_maps.maps import HeightFields
-from mitransient_lidar.transport.light_maps.renderer import (
+from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
+from mitransient_lidar.transport.light_maps.suitability import (
     REACH_THE_SURFACE,
-    LightMapRenderer,
     UnsuitedError,
     light_faintly,
     over_water,

@@ -13,7 +13,7 @@ import xarray as xr
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked, positive_option
+from mitransient_lidar.core.options import Instrument, Option, SceneOrResult, Sensor, checked, one_of, positive_option
 from mitransient_lidar.core.validation import FloatArray, IntArray, require_memory
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
@@ -24,6 +24,8 @@ from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
 from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
 from mitransient_lidar.rendering.passes import (
     DEFAULT_MAX_MEMORY_GB,
+    LIGHT,
+    Light,
     PassShare,
     Progress,
     ProgressCallback,
@@ -31,12 +33,13 @@ from mitransient_lidar.rendering.passes import (
     pass_seed,
     warn_of_edge_loss,
 )
-from mitransient_lidar.rendering.scene_checks import check_scene
+from mitransient_lidar.rendering.scene_checks import check_scene, warn_of_shadows
 from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotPoses
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.gate_stack import build_gates
+from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
 from mitransient_lidar.transport.paths.histogram import GateWeights
-from mitransient_lidar.transport.paths.passes import PassRenderer
+from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 _LOG = logging.getLogger(__name__)
@@ -75,6 +78,7 @@ def render_frames(
     pass_share: PassShare = None,
     max_memory: Annotated[float | None, positive_option("Memory for all frames [GB], by default 2")] = None,
     seed: SignedSeed = None,
+    light: Light = None,
     integrator: Any = None,
     instrument: Instrument = None,
     sensor: Sensor = None,
@@ -93,6 +97,8 @@ def render_frames(
         Passes per image, 2 to 10 000. Each renders one pulse, at its own time, drawn from its own part of the image's
         pulses (`GateSequence.sampled_pulse`): the mean over them is unbiased. Standard errors come from the passes'
         spread. For images with many pulses they are at most too large: they include the change in the sea.
+    light
+        As for `render.render`.
 
     Returns
     -------
@@ -122,11 +128,13 @@ def render_frames(
     moving |= {"speed": speed, "heading_deg": heading_deg}
     sequence = GateSequence(plan.train.count, plan.train.pulses, frames, **moving, seed=seed)
     _check_size(sequence, session.sensor.receiver.pixels.count, limit)
-    chosen = choose_integrator(session.scene, integrator)
-    renderer = _prepare(session, chosen, sequence)
+    chosen, by_maps = choose_integrator(session.scene, integrator), one_of("light", light or LIGHT[0], LIGHT) == "maps"
+    renderer = _prepare(session, chosen, sequence, by_maps)
     lidar = renderer.scene
     session.tell_axis(lidar.axis, lidar.record_end)
     check_scene(renderer.probe)
+    if by_maps:
+        warn_of_shadows(lidar)
     window = ErrorWindow.of_probe(renderer.probe)
     described = describe_scene(renderer.probe, window, renderer.focusing)
     train = placed_gates(lidar, described.get("surface_time_ns"), float(window.start_ns.min()))
@@ -142,6 +150,7 @@ def render_frames(
         renderer.used_values,
         **{**described, **moving, "frames": frames, "seed": seed, "passes": passes, "pass_share": share},
         **{"max_memory_gb": limit, "interrupted": int(interrupted), "surface_edge_loss": lost},
+        **({"light": light} if by_maps else {}),
         elapsed_s=time.perf_counter() - began,
     )
     pixels, shape = lidar.receiver.pixels, (done, sequence.gates, lidar.receiver.pixels.count)
@@ -157,13 +166,15 @@ def render_frames(
     return with_lines_of_sight(stack, lidar)
 
 
-def _prepare(session: LoadedScene, integrator: Any, sequence: GateSequence) -> PassRenderer:
+def _prepare(session: LoadedScene, integrator: Any, sequence: GateSequence, by_maps: bool) -> PassRenderer:
     """Return the scene's renderer, whose record contains the light at all platform locations."""
     loaded = session.scene, session.sensor
     ends = np.array([sequence.frames - 1]), np.arange(sequence.gates), sequence.pulses - 1
     last = sequence.displacements(sequence.times(*ends).max())
     shifts = [(float(x), float(y)) for x, y in np.linspace(0, 1, _PLACES)[:, None] * last] if last.any() else [(0, 0)]
     axis = find_lidar_scene(*loaded, shifts=shifts).axis
+    if by_maps:
+        return LightMapRenderer(find_lidar_scene(*loaded, axis=axis), PathClasses(), image=True)
     renderer: PassRenderer = integrator.prepare(*loaded, axis=axis)
     return renderer
 

@@ -54,7 +54,7 @@ from mitransient_lidar.rendering.shots.batches import (
 from mitransient_lidar.rendering.shots.scene import AIM, TARGET, ShotScene
 from mitransient_lidar.rendering.shots.truth import SeaMap, sea_of, truth_coordinates
 from mitransient_lidar.results.attributes import described, join
-from mitransient_lidar.transport.light_maps.renderer import UnsuitedError
+from mitransient_lidar.transport.light_maps.suitability import UnsuitedError
 
 _LOG = logging.getLogger(__name__)
 

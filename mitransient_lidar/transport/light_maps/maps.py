@@ -51,7 +51,7 @@ class HeightFields:
         Parameters
         ----------
         values, corners
-            As in `physics.sea.sea_surface.SeaSurface.height_patches`, in the shapes\' frame.
+            As in `physics.sea.sea_surface.SeaSurface.height_patches`, in the shapes' frame.
         cell
             Side of a cell [m].
         wind_direction

@@ -16,24 +16,23 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import BoolArray, FloatArray
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import refract_level
-from mitransient_lidar.physics.sea.shoaling import ShoalingHeights
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.two_way_spread import TwoWaySpread
 from mitransient_lidar.transport.light_maps.maps import FEWEST_CELLS, HeightFields, LightMaps, Planes
+from mitransient_lidar.transport.light_maps.suitability import REACH_THE_SURFACE, UnsuitedError, unsuited
 from mitransient_lidar.transport.medium.water_phases import table_of
 from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index
 from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, ReceivedLight
 from mitransient_lidar.transport.paths.refracted_connection import StraightConnection
 from mitransient_lidar.transport.paths.ripple_focusing import Echo
 from mitransient_lidar.transport.pose import KernelPose
-from mitransient_lidar.transport.probe import Rays, first_along
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.solids import box_of, met_shape
+from mitransient_lidar.transport.sensor.receiver import SensorSample
+from mitransient_lidar.transport.solids import met_shape
 
 #: Numbers of the random sequences within a pass.
 _BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS = range(5)
@@ -41,8 +40,8 @@ _BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS = range(5)
 #: Planes of maps below the mean sea level, and paths of scattered light at each depth.
 _PLANES, _PATHS = 16, 2**12
 
-#: Least downward component of rays in the air and in the water, and largest angle of the receiver from nadir [deg].
-_LEAST_DOWN, _LARGEST_ANGLE = 0.1, 45.0
+#: Least downward component of rays in the air and in the water.
+_LEAST_DOWN = 0.1
 
 #: Spreads of waters that were drawn before, and their largest number; step of their angles [deg].
 _SPREADS: dict[tuple[Any, ...], TwoWaySpread] = {}
@@ -51,23 +50,8 @@ _MOST_SPREADS, _ANGLE_STEP = 16, 2.0
 #: Step of the depths of the lowest planes, which lidars of a flight share [m].
 _DEPTH_STEP = 0.5
 
-#: Largest distance of laser and receiver over their range, and angle between their axes [rad].
-_APART = 0.05
-
-#: Largest mean number of scattering events on one way to the bottom, beyond which light arrives too late.
-_MOST_EVENTS = 8.0
-
-#: Largest share of a pixel's light that meets a target whose shadow is left out, and deflection by waves over depth.
-_SHADOWED, _DEFLECTED = 0.1, 0.05
-
 #: Largest slope of a bottom on which displaced light arrives at another depth: steeper ones are sides.
 _STEEPEST = 1.0
-
-#: Least depth of the bottom below a beam [m], and rays of the beam that must reach it.
-_LEAST_DEPTH, _RAYS_TO_BED = 0.05, 64
-
-#: Reason against the light of shots over land, or over solids near the surface.
-REACH_THE_SURFACE = "solids reach the surface"
 
 #: Rays of the view for each pixel of an image, and their limits.
 _RAYS_PER_PIXEL, _FEWEST_RAYS, _MOST_RAYS = 16, 2**15, 2**21
@@ -75,6 +59,9 @@ _RAYS_PER_PIXEL, _FEWEST_RAYS, _MOST_RAYS = 16, 2**15, 2**21
 #: Cells of an image's maps in the shortest wave of its sea, their largest number along a side, and rays of the beam for
 #: each.
 _CELLS_PER_WAVE, _MOST_CELLS, _BEAM_PER_CELL = 2.5, 480, 4
+
+#: Memory of a cell of the maps, and of a ray of the beam and the view [bytes].
+_BYTES_PER_CELL, _BYTES_PER_BEAM, _BYTES_PER_RAY = 12, 60, 120
 
 #: Distance beyond all waves that focus light [m].
 _FAR = 1e3
@@ -137,13 +124,6 @@ class _Seen:
     turned: mi.Float  #: Reflected radiance over the energy through a horizontal area [1/sr].
 
 
-class UnsuitedError(UserError):
-    """A scene that light maps are not for, for a reason."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(f"light maps do not suit the scene: {reason}; use light = 'merging'")
-
-
 class LightMapRenderer(PassRenderer):
     """Renders passes over waves, water of one refractive index and a bottom; see `unsuited`.
 
@@ -183,12 +163,22 @@ class LightMapRenderer(PassRenderer):
         self._turned = aligned(mi.Float, np.array(turned, np.float32))
         self._ripples = scene.seas[0].rippled(scene.refractive_index) if level else scene.surfaces[0].bsdf()
         self._sea = HeightFields.about(scene, level=level)
+        self._kept: tuple[Any, LightMaps] | None = None
         self._solids = scene.solids_alone
 
     @property
     def path_count(self) -> int:
         """Number of rays in a pass from either end."""
         return round(self.paths * (1 + self._sampling.beam))
+
+    @property
+    def memory(self) -> tuple[float, float]:
+        """Memory of maps, and of rays for each received pixel [bytes]."""
+        beams, of_maps = self.paths * self._sampling.beam, self._planes.depths.size * self._planes.cells**2
+        return (
+            _BYTES_PER_CELL * of_maps + _BYTES_PER_BEAM * beams,
+            _BYTES_PER_RAY * self.paths / self.scene.receiver.pixels.count,
+        )
 
     @property
     def used_values(self) -> dict[str, float]:
@@ -200,13 +190,26 @@ class LightMapRenderer(PassRenderer):
         return changed(self, scene=scene, _sea=sea)
 
     def trace(self, received: ReceivedLight, shots: Shots, paths: int) -> None:
-        """Look up one pass's light for each shot, with a number of view rays."""
-        maps = self._maps(shots, max(round(self._sampling.beam * paths), 1))
+        """Look up the light of one pass for each shot, with a number of rays of the view."""
+        maps = self._maps(shots, max(round(self._sampling.beam * paths), 1), keep=received.tile is not None)
         self._reflect(received, shots, self._sampling.glints * paths)
-        seen = self._view(shots, paths)
-        self._return(received, shots, paths, maps, seen, _WATER)
-        if self.scene.solids:
-            self._return(received, shots, paths, maps, seen, _BOTTOM)
+        lanes, sample = self._sample(received, shots, paths, _VIEW)
+        if dr.width(lanes.number) == 0:
+            return
+        seen = self._view(shots, lanes, sample)
+        for origin in (_WATER, _BOTTOM) if self.scene.solids else (_WATER,):
+            self._return(received, shots, paths, maps, seen, lanes, origin)
+
+    def _sample(self, received: ReceivedLight, shots: Shots, count: int, purpose: int) -> tuple[Lanes, SensorSample]:
+        """Return `count` rays of the view, or those of the tile's pixels."""
+        lanes = shots.paths(count)
+        sample = self.sampler.sample_shots(lanes, count, shots.streams(purpose, lanes))
+        if received.tile is None:
+            return lanes, sample
+        first, size = map(opaque_index, (received.tile.start, len(received.tile)))
+        own = dr.compress((sample.weight > 0) & (sample.pixel - first < size))
+        lanes = replace(lanes, number=own)
+        return lanes, self.sampler.sample_shots(lanes, count, shots.streams(purpose, lanes))
 
     def _meet_sea(
         self, scene: LidarScene, lanes: Lanes, pose: KernelPose, angles: mi.Point2f, active: mi.Bool
@@ -227,8 +230,16 @@ class LightMapRenderer(PassRenderer):
         wet = active & (bs.wo.z < 0) & (direction.z < -_LEAST_DOWN) & (value[0] > 0)
         return _Rays(si.p, direction, length, dr.select(wet, weight * value[0], 0), wet)
 
-    def _maps(self, shots: Shots, count: int) -> LightMaps:
-        """Return the beams' maps, each with a number of rays."""
+    def _maps(self, shots: Shots, count: int, *, keep: bool = False) -> LightMaps:
+        """Return the maps of the beams, of a number of rays each; the last ones if they are kept."""
+        if keep and self._kept is not None and self._kept[0] == (shots.seeds, count):
+            return self._kept[1]
+        maps = self._add_beams(shots, count)
+        self._kept = ((shots.seeds, count), maps) if keep else None
+        return maps
+
+    def _add_beams(self, shots: Shots, count: int) -> LightMaps:
+        """Return new maps of the beams, of a number of rays each."""
         scene, water = self.scene, self.scene.required_water
         lanes = shots.paths(count)
         moved, (x, y, *ripple) = lanes.pick(scene), _spaced(shots, lanes, _BEAM, 5)
@@ -254,8 +265,9 @@ class LightMapRenderer(PassRenderer):
 
     def _reflect(self, received: ReceivedLight, shots: Shots, count: int) -> None:
         """Add the light that the sea reflects to rays of the view."""
-        lanes = shots.paths(count)
-        sample = self.sampler.sample_shots(lanes, count, shots.streams(_GLINTS, lanes))
+        lanes, sample = self._sample(received, shots, count, _GLINTS)
+        if dr.width(lanes.number) == 0:
+            return
         moved = lanes.pick(self.scene)
         si, length = self._meet_sea(moved, lanes, moved.receiver_pose, sample.angles, sample.weight > 0)
         line, seen = StraightConnection.to_laser(moved, si.p), si.is_valid()
@@ -263,10 +275,8 @@ class LightMapRenderer(PassRenderer):
         energy, none = glint * line.irradiance * sample.weight, mi.UInt32(0)
         received.receive(sample.pixel, none, mi.UInt32(1), none, length + line.length, energy, seen & (energy > 0))
 
-    def _view(self, shots: Shots, count: int) -> _Seen:
-        """Return the rays of the view in the water, and what they meet."""
-        lanes = shots.paths(count)
-        sample = self.sampler.sample_shots(lanes, count, shots.streams(_VIEW, lanes))
+    def _view(self, shots: Shots, lanes: Lanes, sample: SensorSample) -> _Seen:
+        """Return rays of the view in the water, and what they meet."""
         moved = lanes.pick(self.scene)
         si, length = self._meet_sea(moved, lanes, moved.receiver_pose, sample.angles, sample.weight > 0)
         ripple = _spaced(shots, lanes, _VIEW, 3)
@@ -293,15 +303,30 @@ class LightMapRenderer(PassRenderer):
         return seen
 
     def _return(
-        self, received: ReceivedLight, shots: Shots, count: int, maps: LightMaps, seen: _Seen, origin: int
+        self,
+        received: ReceivedLight,
+        shots: Shots,
+        count: int,
+        maps: LightMaps,
+        seen: _Seen,
+        own: Lanes,
+        origin: int,
     ) -> None:
-        """Add the light that returns from the water, or from the bottom, to rays of the view."""
+        """Add the light that returns from the water, or from the bottom, to rays of the view, `own` of the `count`."""
         scene, water, from_bed = self.scene, self.scene.required_water, origin == _BOTTOM
-        per_ray, of_shot = self._sampling.at_bottom if from_bed else self._sampling.depths, opaque_index(count)
+        per_ray, each = (
+            self._sampling.at_bottom if from_bed else self._sampling.depths,
+            dr.width(own.number) // shots.count,
+        )
+        of_shot = opaque_index(each)
         # Depth after depth: neighbours in a packet read neighbours in maps.
-        lanes = shots.paths(count * per_ray)
+        lanes = shots.paths(each * per_ray)
         part = lanes.number // of_shot
-        seen = dr.gather(_Seen, seen, lanes.shot * of_shot + lanes.number - part * of_shot)
+        ray = lanes.number - part * of_shot
+        seen = dr.gather(_Seen, seen, lanes.shot * of_shot + ray)
+        if received.tile is not None:
+            # Random numbers as of all rays.
+            lanes = replace(lanes, number=part * opaque_index(count) + dr.gather(mi.UInt32, own.number, ray))
         u, pick, path = _spaced(shots, lanes, origin, 3)
         rays, thickness = seen.rays, opaque(float(self._planes.depths[-1]) / self._sampling.depths)
         # Before all light is received: a new number in memory ends the kernel.
@@ -361,116 +386,9 @@ def _spread_of(
     return _SPREADS[key]
 
 
-def unsuited(scene: LidarScene) -> str | None:
-    """Return why light maps are not for a scene, or None. Shots must also be `over_water`."""
-    if scene.submerged:
-        return "the lidar is under water"
-    if scene.water is None or len(scene.surfaces) != 1 or len(scene.seas) != 1:
-        return "it needs water below one ocean_surface"
-    sea, axis = scene.seas[0], scene.receiver.pose.axis
-    if np.degrees(np.arccos(np.clip(-float(axis[2]), -1, 1))) > _LARGEST_ANGLE:
-        return f"the receiver looks more than {_LARGEST_ANGLE:g} degrees from nadir"
-    if not sea.has_ripples or sea.sea.has_foam:
-        return "its sea has a BSDF of its own, or foam"
-    if len(scene.water.index_layers.boundaries):
-        return "its water has several refractive indices"
-    if scene.water.plume is not None:
-        return "its water has bubbles"
-    if scene.perturbations.count:
-        return "derivatives need paths"
-    if scene.has_veils or scene.has_shared_gaps or scene.has_specular_solids:
-        return "solids are transparent or mirror-like"
-    events = _events(scene)
-    apart = (
-        np.linalg.norm(scene.receiver.pose.origin - scene.transmitter.pose.origin) / scene.receiver.pose.ground_range
-    )
-    if max(apart, np.linalg.norm(axis - scene.transmitter.pose.axis)) > _APART:
-        return "laser and receiver look from different places, or along different axes"
-    if events > _MOST_EVENTS:
-        return f"light scatters {events:.2g} times on its way to the bottom, more than {_MOST_EVENTS:g}"
-    return None
-
-
-def over_water(scene: LidarScene, places: FloatArray, turns: FloatArray | None) -> BoolArray:
-    """Return which shots have solids below the sea alone in their beam, shape (shots,); arguments as `light_faintly`.
-
-    Beam rays, the outermost among them, pass the sea without meeting a solid: down to 0.05 m or, where waves do not
-    follow the bottom, to the lowest trough.
-    """
-    wet = np.ones(len(places), dtype=bool)
-    if not scene.has_dry_solids:
-        return wet
-    follows = isinstance(scene.seas[0].sea.waves, ShoalingHeights)
-    lowest = 0.0 if follows or scene.sea_heights is None else scene.sea_heights[0]
-    rays, pose = Rays.of_beam(scene, scene.transmitter), scene.transmitter.pose
-    start, end = (
-        (pose.origin + rays.directions * ((z - pose.origin[2]) / rays.directions[:, 2:]) - pose.ground_point())
-        for z in (pose.origin[2], min(lowest, -_LEAST_DEPTH))
-    )
-    outermost = np.argsort(-np.linalg.norm(end - end.mean(axis=0), axis=1))[: _RAYS_TO_BED // 2]
-    some = np.concatenate([outermost, np.linspace(0, len(end) - 1, _RAYS_TO_BED // 2).astype(np.intp)])
-    turned = np.ones(len(places), dtype=complex) if turns is None else turns @ [1, 1j]
-
-    def among_solids(points: FloatArray) -> FloatArray:
-        away = np.multiply.outer(turned, points[some, :2] @ [1, 1j])
-        level = np.stack([away.real, away.imag], axis=-1) + places[:, np.newaxis]
-        return np.insert(level.reshape(-1, 2), 2, np.tile(points[some, 2], len(places)), axis=1)
-
-    met = first_along(scene, [among_solids(start), among_solids(end)])[:, 2]
-    return np.asarray(np.isnan(met).reshape(len(places), -1).all(axis=1))
-
-
-def light_faintly(scene: LidarScene, target: mi.Shape, places: FloatArray, turns: FloatArray | None) -> BoolArray:
-    """Return which shots light a target so faintly that its shadow needs no merging, shape (shots,).
-
-    In each pixel at most the share `_SHADOWED` of the beam over a level sea meets the target's box, widened as waves
-    deflect the light.
-
-    `scene`, `target`: the lidar's scene, and a target of it. `places`: points (x, y) of the shots among the shapes [m],
-    shape (shots, 2). `turns`: cosine and sine of their rotations about the vertical, shape (shots, 2); None without
-    any.
-    """
-    low, high = box_of(target)
-    rays = Rays.of_beam(scene, scene.transmitter)
-    pixel, seen = scene.receiver.pixels.pixel_at(rays.angles.x, rays.angles.y, mi.Float(0.5))
-    pixel, counted = np.array(pixel), np.array(seen) > 0
-    pose, height = scene.transmitter.pose, 0.5 * (low[2] + high[2])
-    lit = scene.level_sea.at_height(pose.origin, rays.directions, height) - pose.ground_point()[:2]
-    counted &= np.isfinite(lit).all(axis=1)
-    lit, pixel = lit[counted] @ [1, 1j], pixel[counted]
-    whole = np.maximum(np.bincount(pixel, minlength=scene.receiver.pixels.count), 1)
-    # A ray that meets the box below or above its middle height does so beside it.
-    axis = np.abs(refract_level(pose.axis, scene.refractive_index))
-    wider = _DEFLECTED * max(-float(low[2]), 0.0) + 0.5 * (high[2] - low[2]) * np.hypot(*axis[:2]) / axis[2]
-    centre, half = (0.5 * (low + high)[:2]), 0.5 * (high - low)[:2] + wider
-    faint = np.ones(len(places), dtype=bool)
-    farthest = float(np.abs(lit).max(initial=0.0))
-    for shot in np.flatnonzero(np.all(np.abs(places - centre) <= half + farthest, axis=1)):
-        turned = lit if turns is None else lit * complex(*turns[shot])
-        beside = np.abs(np.stack([turned.real, turned.imag], axis=-1) + places[shot] - centre)
-        met = np.bincount(pixel[np.all(beside <= half, axis=1)], minlength=whole.size)
-        faint[shot] = np.all(met <= _SHADOWED * whole)
-    return faint
-
-
-def reach_of_scattering(scene: LidarScene) -> float:
-    """Return the depth to which light of a scene scatters rarely enough for light maps [m], at most 1 km."""
-    down = -float(refract_level(scene.receiver.pose.axis, scene.refractive_index)[2])
-    depths = np.linspace(0, 1e3, 10_001)
-    events = scene.required_water.column.optical_depth_of_scattering(depths) / down
-    return float(depths[np.searchsorted(events, _MOST_EVENTS) - 1])
-
-
 def _far_apart(depths: FloatArray) -> FloatArray:
     """Return a distance at which waves enhance no light [m]."""
     return np.full(depths.shape, _FAR)
-
-
-def _events(scene: LidarScene) -> float:
-    """Return the mean number of scattering events on the way to the lowest bottom."""
-    lowest = min((float(solid.bbox().min.z) for solid in scene.bottoms), default=0.0)
-    down = -float(refract_level(scene.receiver.pose.axis, scene.refractive_index)[2])
-    return float(scene.required_water.column.optical_depth_of_scattering(max(-lowest, 0.0))) / down
 
 
 def _deepest(scene: LidarScene, cos_water: float) -> float:

@@ -84,6 +84,18 @@ class MergingRenderer(PassRenderer):
         return self.paths + self.photons
 
     @property
+    def memory(self) -> tuple[float, float]:
+        """Memory of light and paths, which all pixels need [bytes]."""
+        return self._memory_of(1, self.paths, self.layout.light_segments, self.layout.sensor_segments), 0.0
+
+    def _memory_of(self, shots: int, paths: int, light: float, sensor: float) -> float:
+        """Return the memory of a pass with segments of light and of the receiver's paths, for each of them [bytes]."""
+        layout, sums = self.layout, self.scene.perturbations.count
+        points = layout.reach / layout.spacing
+        of_light = self.photons * memory_of_path(light, points, sums, layout.hits)
+        return shots * (of_light + paths // self._every(paths) * memory_of_path(sensor, points, sums))
+
+    @property
     def used_values(self) -> dict[str, float]:
         """Values used for parameters of the integrator that may be automatic; lengths in metres."""
         lengths = {"cell_size": self.layout.patches.width / PATCH_PER_CELL, "point_spacing": self.layout.spacing}
@@ -143,15 +155,9 @@ class MergingRenderer(PassRenderer):
 
     def _fit_segments(self, shots: Shots, paths: int) -> None:
         """Cut the segment capacities to the memory; raise `UserError` if it cannot hold what a pass needs."""
-        layout, count, sums = self.layout, shots.count, self.scene.perturbations.count
-        points = layout.reach / layout.spacing
-
-        def size(light: float, sensor: float) -> float:
-            of_light = self.photons * memory_of_path(light, points, sums, layout.hits)
-            return count * (of_light + paths // self._every(paths) * memory_of_path(sensor, points, sums))
-
+        layout, count = self.layout, shots.count
         needed, wanted = layout.least_segments, (layout.light_segments, layout.sensor_segments)
-        least, most = size(*needed), size(*wanted)
+        least, most = (self._memory_of(count, paths, *each) for each in (needed, wanted))
         what = f"{count * self.photons} photons and {count * paths} paths"
         taken = require_memory(what, most, "take fewer photons_per_pass or paths_per_pass", least)
         if taken < most:

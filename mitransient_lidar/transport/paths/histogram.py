@@ -214,13 +214,14 @@ class TransientHistogram:
         """Return energies or their derivatives as float64, shape (channel, *shape)."""
         sums = self._both_sums()[:, :-1].reshape(2, -1, self._each)[:, chosen]
         found = sums[0] * self._units[0] + sums[1] * self._units[1]
-        invalid = np.array(self._invalid).reshape(-1, self._each) > 0
+        invalid = self._invalid.numpy().reshape(-1, self._each) > 0
         found[:, invalid[0 if chosen.start == 0 else -1]] = np.nan
         return np.asarray(found.reshape(-1, *self.shape))
 
     def _both_sums(self) -> np.ndarray:
         """Return coarse and fine sums, shape (2, sums + 1)."""
-        return np.array(self._sums)[: 2 * (self._count + 1)].reshape(2, -1)
+        # A view on the processor: copies of large images took as much memory as they do.
+        return np.asarray(self._sums.numpy()[: 2 * (self._count + 1)].reshape(2, -1))
 
     def rounded_energy(self) -> np.ndarray:
         """Return `energy` as float32, at a quarter of the cost."""

@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.transport.opaque import changed
+from mitransient_lidar.transport.opaque import changed, opaque_index
 from mitransient_lidar.transport.paths.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.paths.ripple_focusing import Echo, RippleFocusing
 from mitransient_lidar.transport.perturbations import Perturbation, Perturbations, Sums
@@ -134,9 +134,16 @@ class ReceivedLight:
     """Light received in one pass: a histogram by pixel, or by pixel class, and time."""
 
     def __init__(
-        self, histograms: Sequence[TransientHistogram], classes: PathClasses, focusing: RippleFocusing | None = None
+        self,
+        histograms: Sequence[TransientHistogram],
+        classes: PathClasses,
+        focusing: RippleFocusing | None = None,
+        tile: range | None = None,
     ) -> None:
         self._all, self.classes, self.focusing = histograms, classes, focusing
+        #: Pixels that are received alone, or None.
+        self.tile = tile
+        self._limits = None if tile is None else (opaque_index(tile.start), opaque_index(len(tile)))
         #: The histogram, and that of gates beside it, or None.
         self.histogram, self.gated = histograms[0], histograms[1] if len(histograms) > 1 else None
         self.clear()
@@ -168,6 +175,9 @@ class ReceivedLight:
             factor = self.focusing.of(echo, order, length)
             energy = energy * factor
             sums = self.focusing.perturb(sums or [], factor, echo, order, length)
+        if self._limits is not None:
+            pixel = pixel - self._limits[0]
+            active = active & (pixel < self._limits[1])
         index = self.classes.index(pixel, order, reversals, solid)
         for each in self._all:
             each.add(index, length, energy, active, sums)
@@ -209,6 +219,11 @@ class PassRenderer(ABC):
     def path_count(self) -> int:
         """Number of paths in a pass from either end."""
         return self.paths
+
+    @property
+    def memory(self) -> tuple[float, float]:
+        """Memory of a pass's paths, for all pixels together and for each received pixel [bytes]."""
+        return 0.0, 0.0
 
     @property
     def used_values(self) -> dict[str, float]:
@@ -253,22 +268,24 @@ class PassRenderer(ABC):
         paths: int | None = None,
         gates: GateWeights | None = None,
         beside: bool = False,
+        tile: range | None = None,
     ) -> ReceivedLight:
         """Render one pass, for one shot or, with several seeds, for several.
 
         Passes with different seeds are independent. Energy is summed over `gates` instead of time bins if they are
-        given, or `beside` them. The pixels of several shots are one row, shot after shot.
+        given, or `beside` them. The pixels of several shots are one row, shot after shot. Of one shot, the pixels of a
+        `tile` may be received alone: they have the same bits, in less memory.
 
         Raises UserError when the histogram would be too large.
         """
         pixels, shots = self.scene.receiver.pixels, Shots(seed if isinstance(seed, Sequence) else [seed])
-        flat = (shots.count * pixels.count * self.classes.count,)
-        shape = flat if self.classes.separate or shots.count > 1 else pixels.grid or flat
+        flat = (shots.count * (pixels.count if tile is None else len(tile)) * self.classes.count,)
+        shape = flat if self.classes.separate or shots.count > 1 or tile else pixels.grid or flat
         scene = self.scene
         emitted, length = scene.transmitter.energy, scene.reference_length
         kinds = (None, gates) if beside else (gates,)
         sums = [TransientHistogram(scene.axis, shape, emitted, kind, length, scene.perturbations) for kind in kinds]
-        received = ReceivedLight(sums, self.classes, self.focusing)
+        received = ReceivedLight(sums, self.classes, self.focusing, tile)
         with dr.suspend_grad():
             self.trace(received, shots, self.paths if paths is None else paths)
         received.evaluate()

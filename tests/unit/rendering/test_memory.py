@@ -198,3 +198,43 @@ LONG = ("bins", "derivatives", "sea", "photons", "shots", "record", "passive", "
 def test_the_estimate_is_within_a_factor_of_two_of_the_peak(name, tmp_path):
     estimate, peak = limited(TASKS[name][0], tmp_path / "record.nc", TASKS[name][1])
     assert 0.5 < estimate / peak < 2, (estimate, peak)
+
+
+#: Renders an image by the command, and prints the stated and the measured memory [GB].
+IMAGE = """
+import logging, re, sys
+from mitransient_lidar.cli.app import main
+found = []
+class Handler(logging.Handler):
+    def emit(self, record):
+        found.extend(re.findall(r"the render takes ([0-9.]+) GB", record.getMessage()))
+log = logging.getLogger("mitransient_lidar.rendering.render")
+log.setLevel(logging.INFO)
+log.addHandler(Handler())
+try:
+    main()
+except SystemExit as ended:
+    assert not ended.code
+peak = int(re.search(r"VmHWM:\\s*(\\d+)", open("/proc/self/status").read())[1])
+print(found[0], 1.024e-6 * peak)
+"""
+
+
+@pytest.mark.parametrize(
+    ("layout", "light", "max_memory"),
+    [
+        pytest.param("256x256", "maps", 0.7, marks=pytest.mark.slow),
+        pytest.param("640x512", "merging", 2, marks=pytest.mark.long),
+        pytest.param("1280x1024", "maps", 1.85, marks=pytest.mark.long),
+    ],
+)
+def test_images_take_the_memory_that_is_stated_before_the_render(layout, light, max_memory, tmp_path):
+    gates = {"gate_start_ns": 1411, "gate_width_ns": 10, "gate_step_ns": 2.4, "gate_count": 40, "layout": layout}
+    values = [word for name, value in gates.items() for word in ("-D", f"{name}={value}")]
+    options = ["--light", light, "--max-memory", str(max_memory), "--passes", "2", "-o", str(tmp_path), "-q"]
+    command = [sys.executable, "-c", IMAGE, "render", "fig09_2x2", *values, *options]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-2000:]
+    stated, peak = map(float, run.stdout.splitlines()[-1].split())
+    assert stated <= max_memory
+    assert 0.85 < peak / stated < 1.15, (peak, stated)

@@ -35,7 +35,7 @@ def clock(monkeypatch):
     """Return the times of a trial's kernels and of its other work [s], to be set, and the number of trials."""
     state = SimpleNamespace(kernels=0.0, rest=0.0, trials=0, now=0.0)
 
-    def timed(renderer, seed, gates):
+    def timed(renderer, seed, gates, tiles):
         assert renderer.share == pass_size.SMALLEST_SHARE
         state.trials += 1
         state.now += state.kernels + state.rest

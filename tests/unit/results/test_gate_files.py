@@ -9,7 +9,7 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.results import exr
+from mitransient_lidar.results import exr, files
 from mitransient_lidar.results.gate_stack import check_stack
 
 ATTRIBUTES = {
@@ -210,3 +210,17 @@ def test_incomplete_sequences_are_rejected(tmp_path, caplog):
         save_sequence(make(), tmp_path, stem)
     with pytest.raises(UserError, match=r"2 sequences of gates: open the first file of one \(b_gate000\.exr, c_"):
         results.open(tmp_path)
+
+
+def test_large_stacks_are_written_without_copies_and_read_exactly(tmp_path, monkeypatch):
+    """Coordinates of many pixels are channels, which other readers see; NetCDF files go to the disk directly."""
+    stack = make()
+    monkeypatch.setattr(exr, "_MOST_LISTED", 7)
+    monkeypatch.setattr(files, "_LARGE", 0)
+    for suffix in (".exr", ".nc"):
+        results.save(stack, tmp_path / f"stack{suffix}")
+        xr.testing.assert_identical(results.open(tmp_path / f"stack{suffix}"), stack)
+    assert files.check_sum(tmp_path / "stack.nc")
+    header, channels, _, _ = parts_by_other_reader(tmp_path / "stack.exr")[-1]
+    assert header["oiio:subimagename"] == "coordinates"
+    assert sorted(channels) == ["angle_x.high", "angle_x.low", "angle_y.high", "angle_y.low"]
