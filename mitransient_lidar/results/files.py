@@ -59,7 +59,7 @@ def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     from xarray.backends import H5NetCDFStore
 
     green, infrared = split(dataset)
-    is_large = dataset.nbytes > _LARGE
+    is_large = dataset.nbytes > _LARGE and hasattr(os, "posix_fallocate")
     with Path(path).open("w+b") as output:
         buffer = output if is_large else io.BytesIO()
         with h5netcdf.File(buffer, "w") as file:
