@@ -285,7 +285,7 @@ class Leaf(SampledBSDF):
     .. math:: f = \frac{R}{\pi} \text{ on the side of the light}, \quad f = \frac{T}{\pi} \text{ on the other side}.
 
     Between two media (``int_ior`` above 1, such as foam on the sea) light from the back, where the index is n,
-    transmits :math:`T / n^2`, as reciprocity requires of diffuse light.
+    transmits :math:`T / n^2`. Reciprocity requires this of diffuse light.
 
     .. example::
 
@@ -344,9 +344,9 @@ class GramCharlierDielectric(SampledBSDF):
     .. math:: 1 - \tfrac{c_{21}}{2} (x^2 - 1) y - \tfrac{c_{03}}{6} (y^3 - 3 y) + \tfrac{c_{40}}{24} (x^4 - 6 x^2 + 3)
               + \tfrac{c_{22}}{4} (x^2 - 1) (y^2 - 1) + \tfrac{c_{04}}{24} (y^4 - 6 y^2 + 3)
 
-    (Cox and Munk 1954, doi:10.1364/JOSA.44.000838). Smith's masking by facets, of one direction with the angle
-    :math:`\theta`, is that of this density, too: with skewness *s* and excess kurtosis *k* of the slope in the
-    direction, its standard deviation :math:`\sigma` and :math:`a = \cot\theta / \sigma`,
+    (Cox and Munk 1954, doi:10.1364/JOSA.44.000838). Smith's masking by facets, for one direction with the angle
+    :math:`\theta`, follows from this density, too. With the slope's skewness *s*, excess kurtosis *k* and standard
+    deviation :math:`\sigma` in the direction, and :math:`a = \cot\theta / \sigma`,
 
     .. math:: \frac{1}{G_1} = 1 + \frac{1}{a} \left[ \varphi(a) \left( 1 + \tfrac{s}{6} a + \tfrac{k}{24} (a^2 - 1)
               \right) - a\, Q(a) \right],

@@ -165,7 +165,7 @@ class LidarMerging(LidarPassIntegrator):
     cell; connections find it (Georgiev et al. 2012, doi:10.1145/2366145.2366211).
 
     A path with several scattering events can arise from a merge at each of them, and from a connection between any two
-    that follow each other. The balance heuristic (Veach and Guibas 1995, doi:10.1145/218380.218498) weights all: with
+    that follow each other. The balance heuristic (Veach and Guibas 1995, doi:10.1145/218380.218498) weights all. With
     coefficient :math:`b_i`, phase function :math:`p_i` and cell volume :math:`V_i` at each event, the length
     :math:`d_i` and the transmittance of scattering :math:`T_i` of the segment to the next one, and the share
     :math:`\kappa` of the pairs of points that are connected, each pair of points of weights *w* and *w'* adds

@@ -92,11 +92,11 @@ class OceanSurface(mi.Mesh):
     have a significant height of 0.15 m instead of 2.6 m. Crests neither turn nor come closer together, and do not run
     up the shore. Wake heights stay within a quarter of the depth; a mean slope stays as given.
 
-    Foam (``foam``) covers whole faces: a thin layer that reflects ``foam_reflectance``, from above and from below,
-    transmits ``foam_transmittance`` as a ``leaf`` does, both evenly over all directions, and absorbs the rest. It lies
-    where the waves rise most above their surroundings within 2 m, and thus follows the crests
-    of short waves, as many as give the cover. On a sea without waves each face has the cover as a share. Foam
-    approaches ``surf_foam`` where the depth limits the waves. A ``foam_map`` states where foam lies besides.
+    Foam (``foam``) covers whole faces. It is a thin layer that reflects ``foam_reflectance``, from above and from
+    below, and transmits ``foam_transmittance`` as a ``leaf`` does, both evenly over all directions. It absorbs the
+    rest. It lies where the waves rise most above their surroundings within 2 m, and thus follows the crests of short
+    waves, as many as give the cover. On a sea without waves each face has the cover as a share. Foam approaches
+    ``surf_foam`` where the depth limits the waves. A ``foam_map`` states where foam lies besides.
 
     A mean slope turns the sea about the patch centre, or about each shot's location in a series. It is as wide as the
     patch; beyond it the sea is level. It adds to the wave slopes, and not to ``slope_variance``.

@@ -206,10 +206,10 @@ class Seabed(mi.Mesh):
               + \tfrac{1}{2} h \cos(2\pi (x \cos\beta + y \sin\beta) / L) + z_\text{map}(x, y).
 
     Points x, y, z [m] are columns with these names or the first three. Points on an even grid are its cells where at
-    least a quarter of the cells have one. Other points are triangulated (Delaunay), and the height is linear in each
-    triangle, :math:`z_\text{map} = \sum_i \lambda_i z_i` with the barycentric coordinates
-    :math:`\lambda_i`, on a grid with the cell :math:`\sqrt{A/N}` for N points in a convex hull of the area A. Cells
-    outside the hull are holes; inside it, triangles also cross gaps between lines of points.
+    least a quarter of the cells have one. Other points are triangulated (Delaunay). The height is linear in each
+    triangle, :math:`z_\text{map} = \sum_i \lambda_i z_i` with the barycentric coordinates :math:`\lambda_i`. The grid
+    has the cell :math:`\sqrt{A/N}` for N points in a convex hull with the area A. Cells outside the hull are holes;
+    inside it, triangles also cross gaps between lines of points.
 
     A bottom without curvature, ripples, map and patches is two triangles. A patch's edge is blurred over one cell.
     The reflectance is a mesh attribute, ``vertex_reflectance``, which a nested BSDF may use through Mitsuba's

@@ -25,9 +25,9 @@ class TimeGatedFilm(mi.Film):
     .. parameters::
 
     With ``auto`` the record is chosen when a scene is rendered, anew after each edit; a result lists it as ``used`` in
-    ``plugin_parameters``. It starts before the first light in any pixel, from the highest crest or a target above it:
-    by three pulse widths or the length of a measured pulse, at least 12 ns. It also starts ten bins before the end of
-    the interval in which ``echoes`` measures the noise, by up to 100 ns more. It ends as much, plus 12 times the
+    ``plugin_parameters``. It starts before the first light in any pixel, from the highest crest or a target above it.
+    The lead is three pulse widths or a measured pulse's length, at least 12 ns. It also starts ten bins before the end
+    of the interval in which ``echoes`` measures the noise, by up to 100 ns more. It ends as much, plus 12 times the
     response time, after the last light in any pixel. The last light comes from a bottom or target. Multiply scattered
     light gets up to 40 ns more, a quarter of the echo's time in the water, and the time from the beam to the edge of
     the view. Where no bottom is seen, or below 1e-12, the last light comes from the depth at which the column signal

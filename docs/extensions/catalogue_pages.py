@@ -1,4 +1,4 @@
-"""Reference of the shipped scenes and instruments, from their XML files."""
+"""Reference for the shipped scenes and instruments, from their XML files."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _write(sphinx: Sphinx) -> None:
 
 
 def _write_pages(folder: Path, introduction: str, pages: dict[str, str], summaries: dict[str, str]) -> None:
-    """Write an index with summaries, and a page of each name."""
+    """Write an index with summaries, and a page for each name."""
     listed = table(("name", ""), ((f"[`{name}`]({name}.md)", _plain(summaries[name])) for name in pages))
     contents = "\n".join(["```{toctree}", ":hidden:", "", *pages, "```"])
     write(folder / "index.md", f"{introduction}\n{listed}\n{contents}\n")
@@ -55,7 +55,7 @@ def _write_pages(folder: Path, introduction: str, pages: dict[str, str], summari
 
 
 def _scene(name: str) -> str:
-    """Return the page of a scene: its comments, parameters with the comments on their lines, and XML."""
+    """Return a scene's page: its comments, parameters with the comments on their lines, and XML."""
     text = catalogue.scene_text(name)
     comments = [textwrap.dedent(one).strip("\n") for one in re.findall(r"<!--(.*?)-->", text, re.DOTALL)]
     about = comments[1] if "\n" in comments[1] else ""
@@ -75,7 +75,7 @@ def _scene(name: str) -> str:
 
 
 def _instrument(one: catalogue.Instrument) -> str:
-    """Return the page of an instrument: sources, parameters and the file of its receiver."""
+    """Return an instrument's page: sources, parameters and its receiver file."""
     rows = [(f"`{parameter.name}`", f"`{parameter.value}`", _plain(parameter.source)) for parameter in one.parameters]
     return "\n".join(
         [

@@ -1,4 +1,4 @@
-"""Reference of the command line, from the Typer app: one section a command, under the headings of the help."""
+"""Command line reference, from the Typer app: one section a command, under the help's headings."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _write(sphinx: Sphinx) -> None:
 
 
 def _overview(headings: dict[str, list[tuple[str, Any]]]) -> str:
-    """Return a table of all commands with the first sentence of their help."""
+    """Return a table with all commands and their help's first sentence."""
     rows = [
         (heading if not number else "", f"[`{name}`](#command-{name})", command.get_short_help_str(limit=200))
         for heading, commands in headings.items()
@@ -55,7 +55,7 @@ def _overview(headings: dict[str, list[tuple[str, Any]]]) -> str:
 
 
 def _section(usage: str, command: Any, level: int) -> str:
-    """Return the section of a command: usage, help, arguments and options."""
+    """Return a command's section: usage, help, arguments and options."""
     context = command.make_context(usage, [], resilient_parsing=True)
     name = usage.removeprefix(f"{_PROGRAM} ")
     line = " ".join([usage, *command.collect_usage_pieces(context)])

@@ -80,7 +80,7 @@ def _write(sphinx: Sphinx) -> None:
 
 
 def _index(found: list[Plugin]) -> str:
-    """Return the index: a table of each kind."""
+    """Return the index: a table for each kind."""
     parts = [_INTRODUCTION]
     for kind, title in _KINDS.items():
         rows = [f"   * - :doc:`{one.name}`\n     - {_summary(one)}" for one in found if one.kind == kind]
@@ -95,7 +95,7 @@ def _summary(plugin: Plugin) -> str:
 
 
 def pictures(plugin: Plugin) -> dict[str, str]:
-    """Return the legends of a plugin's pictures by their files in ``docs/images/plugins``."""
+    """Return the legends for a plugin's pictures by their files in ``docs/images/plugins``."""
     legends = {}
     if plugin.kind == "phase":
         legends[f"{plugin.name}_angles.png"] = "The phase function of this example against the scattering angle."
@@ -138,7 +138,7 @@ def _page(plugin: Plugin) -> str:
 
 
 def example(manual: str, language: str) -> str:
-    """Return the example of a manual in ``xml`` or ``python``."""
+    """Return a manual's example in ``xml`` or ``python``."""
     block = re.search(rf"^\.\. code-block:: {language}\n\n((?:(?: .*)?\n?)+)", manual, re.MULTILINE)
     assert block is not None
     return textwrap.dedent(block[1]).strip()

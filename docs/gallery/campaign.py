@@ -14,8 +14,8 @@ import numpy as np
 import mitransient_lidar
 
 # %%
-# Parameters that vary are ranges, lists or expressions of others; ``fixed`` has the others. A receiver records
-# each run, and the echoes are sought in its noisy signal.
+# Parameters that vary are ranges, lists or expressions with others; ``fixed`` has the others. A receiver records each
+# run, and the echoes are sought in its noisy signal.
 
 CAMPAIGN = {
     "scene": "table1",
@@ -58,6 +58,6 @@ right.set(xlabel="attenuation times depth", ylabel="error of the depth (cm)")
 plt.show()
 
 # %%
-# **What to see.** Left, four runs of the campaign: deep bottoms in turbid water are weak. Right, what the shipped
-# detector finds in all records: most depths are some centimetres to a decimetre too deep, as scattered light arrives
-# late. Bars are the stated errors, one standard deviation of noise and method.
+# **What to see.** Left, four campaign runs: deep bottoms in turbid water are weak. Right, what the shipped detector
+# finds in all records: most depths are some centimetres to a decimetre too deep, as scattered light arrives late. Bars
+# are the stated errors, one standard deviation of noise and method.

@@ -12,8 +12,8 @@ from mitransient_lidar import render_passive
 from mitransient_lidar.plots.drawing import plain_logarithms
 
 # %%
-# ``passive_sea`` looks 35 degrees off nadir at a bottom of 8 m with a white plate and a dark sphere; the sun stands 40
-# degrees from the vertical, ahead and to the left. 40x40 pixels.
+# ``passive_sea`` looks 35 degrees off nadir at a bottom 8 m deep, with a white plate and a dark sphere. The sun stands
+# 40 degrees from the vertical, ahead and to the left. 40x40 pixels.
 
 image = render_passive("passive_sea", {"layout": "40x40"}, passes=8, seed=1, filter_width_nm=1.0)
 error = float((image.radiance_stderr / image.radiance).median())
@@ -38,6 +38,6 @@ row, column = np.unravel_index(np.argmax(image.radiance.values), image.radiance.
 print(f"brightest pixel: {1e3 * float(image.radiance[row, column]):.0f} mW/(m^2 sr nm) in row {row}, column {column}")
 
 # %%
-# **What to see.** The plate shines through 8 m of water left of the centre; right of it the sphere, and the shadow that
-# the sun casts from it, are dark. Near the left and lower edges waves mirror the sun, which stands on the left: single
-# pixels are up to four times brighter than the water.
+# **What to see.** Left of the centre, the plate shines through 8 m of water. Right of it, the sphere and its shadow by
+# the sun are dark. Near the left and lower edges waves mirror the sun, which stands on the left: single pixels are up
+# to four times brighter than the water.

@@ -11,8 +11,7 @@ import numpy as np
 import mitransient_lidar
 
 # %%
-# Attenuation c, scattering b and backscattering bb, each with the other two held fixed, and the reflectance of the
-# bottom.
+# Attenuation c, scattering b and backscattering bb, each with the other two held fixed, and the bottom reflectance.
 
 NAMES = ["attenuation", "scattering", "backscattering", "bottom_reflectance"]
 shot = mitransient_lidar.render(
@@ -20,7 +19,7 @@ shot = mitransient_lidar.render(
 )
 
 # %%
-# In percent of the power for one percent more of the parameter.
+# In percent of the power, for a one percent larger parameter.
 
 power = shot.waveform.isel(pixel=0)
 lit = power > 1e-3 * power.max()
@@ -36,8 +35,8 @@ lower.legend(frameon=False, fontsize="small")
 plt.show()
 
 # %%
-# A check in closed form: light that returns from the bottom has travelled at least twice the slant path in the water,
-# so that 1 % more c removes about 2 c d / cos(theta) percent of it, with theta the angle in the water.
+# A check in closed form: light from the bottom has travelled at least twice the slant path in the water. With the angle
+# theta in the water, 1 % more c thus removes about 2 c d / cos(theta) percent of it.
 
 cosine = np.sqrt(1 - (np.sin(np.radians(20)) / 1.34) ** 2)
 peak = power.sel(time=slice(1480, None)).idxmax("time")

@@ -27,9 +27,8 @@ near, far = (
 )
 
 # %%
-# A tail of 1e-3 of the surface's peak with a decay time of 300 ns contains this share of the charge: 1e-3 times 300 ns
-# divided by the echo's duration (its energy over its peak). Ions arrive at the cathode 150 ns late, with 2 % of the
-# charge.
+# A tail has 1e-3 of the surface's peak and decays in 300 ns. Its share of the charge is 1e-3 times 300 ns divided by
+# the echo's duration (energy divided by peak). Ions arrive at the cathode 150 ns late, with 2 % of the charge.
 
 light = near.waveform.isel(pixel=0)
 duration = float(light.sum() / light.max())
@@ -56,8 +55,8 @@ receivers = {
 }
 
 # %%
-# Two hundred shots of each, with the gain that keeps the whole record in range, and with ten times as much, which clips
-# the surface echo as a deep channel does. Depths are against the mean sea level, which shows the trigger.
+# Two hundred shots of each, with the gain that keeps the whole record in range, and with ten times this gain. The
+# latter clips the surface echo, as a deep channel does. Depths are against the mean sea level, which shows the trigger.
 
 SHOTS = 200
 
@@ -117,8 +116,8 @@ plt.show()
 
 # %%
 # **What to see.** The signal is clipped at 1 V for 53 ns. A tail changes the depth by millimetres and makes no false
-# bottoms, as it has no peak. Late ions repeat surface and column after 150 ns: this light counts as a bottom in half
-# of the records without one, and reduces the depth by 3 to 4 cm. Through a coupling capacitor the baseline falls by 4
-# mV, or 42 mV behind ten times the gain. This shifts the depth by 2 cm and makes the column seem to decay faster. An
-# amplifier that is blind for 100 ns misses the bottom where the surface overloads it. Energy changes the height of the
-# echo and not its depth; trigger and clock add about 1 cm to depths against the mean sea level.
+# bottoms, as it has no peak. Late ions repeat surface and column after 150 ns. This light counts as a bottom in half
+# the records without one, and reduces the depth by 3 to 4 cm. Through a coupling capacitor the baseline falls by 4 mV,
+# or 42 mV behind ten times the gain. This shifts the depth by 2 cm and makes the column seem to decay faster. An
+# amplifier that is blind for 100 ns misses the bottom where the surface overloads it. Energy changes the echo's height
+# and not its depth; trigger and clock add about 1 cm to depths against the mean sea level.

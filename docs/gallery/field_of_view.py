@@ -10,14 +10,14 @@ import matplotlib.pyplot as plt
 import mitransient_lidar
 
 # %%
-# A narrow beam of 0.5 mrad on level water of c = 0.3 1/m and a = 0.15 1/m, nearly without ripples, which would refract
-# light out of a narrow view as well.
+# A narrow 0.5 mrad beam on level water with c = 0.3 1/m and a = 0.15 1/m. It is nearly without ripples, which would
+# refract light out of a narrow view as well.
 
 SCENE = {"divergence_mrad": 0.5, "bottom_depth": 12, "spectrum": "flat", "slope_variance": 2e-5}
 found = mitransient_lidar.scattering("table1", SCENE, fov_mrad=[1, 5, 20, 80], passes=4, seed=1)
 
 # %%
-# K is half the decay of the power along the path in the water.
+# K is half the power's decay along the path in the water.
 
 figure, axis = plt.subplots(figsize=(7, 3.6), layout="constrained")
 axis.errorbar(found.scaled_radius, found.effective_attenuation, found.effective_attenuation_stderr, fmt="o-", capsize=3)
@@ -39,5 +39,5 @@ for field in found.field_of_view.values:
     print(f"{field:g} mrad: K = {value:.3f} +- {error:.3f} 1/m")
 
 # %%
-# **What to see.** The wider the view, the slower the column decays: from close to c where the spot in view is a small
-# part of a scattering length, to nearly the absorption where it is larger.
+# **What to see.** The wider the view, the slower the column decays. The decay is close to c where the spot in view is
+# much smaller than a scattering length, and nearly the absorption where it is larger.

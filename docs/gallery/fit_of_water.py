@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import mitransient_lidar
 
 # %%
-# The measurement is a record with the noise of a receiver, of a render whose parameters we pretend not to know.
+# The measurement is a render's record with receiver noise. Its parameters count as unknown.
 
 SCENE = {"layout": "1x1", "spectrum": "flat"}
 TRUTH = {"attenuation": 0.34, "bottom_reflectance": 0.14}
@@ -18,8 +18,8 @@ shot = mitransient_lidar.render("table1", params={**SCENE, **TRUTH}, passes=8, s
 data = mitransient_lidar.record(shot, "apd", gain="auto", seed=1)
 
 # %%
-# The fit begins at the values of the scene, 0.3 1/m and 0.1. It uses few passes here, and states what they add to
-# the errors.
+# The fit begins at the scene's values, 0.3 1/m and 0.1. It uses few passes here, and states what they add to the
+# errors.
 
 fitted = mitransient_lidar.fit(
     data, "table1", list(TRUTH), params=SCENE, start={"attenuation": 0.3, "bottom_reflectance": 0.1}, passes=4
@@ -46,6 +46,6 @@ lower.set(xlabel="time (ns)", ylabel="residual / error")
 plt.show()
 
 # %%
-# **What to see.** The fit goes through the record from the surface to the bottom, where the residuals are
-# noise, most within two standard deviations. Before and after, the noise is less than a step of the digitiser: the
-# record is constant, and so is its difference from the fit.
+# **What to see.** The fit goes through the record from the surface to the bottom, where the residuals are noise, most
+# within two standard deviations. Before and after, the noise is less than a digitiser step: the record is constant, and
+# so is its difference from the fit.

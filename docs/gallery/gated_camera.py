@@ -11,7 +11,7 @@ import numpy as np
 import mitransient_lidar
 
 # %%
-# Ten gates of 4 ns from 8 m on, and pulses of 0.5 µJ; 16 passes, so that the light is smoother than the frames.
+# Ten 4 ns gates from 8 m on, and 0.5 µJ pulses; 16 passes, so that the light is smoother than the frames.
 
 params = {"target_depth": 9, "target_x": 2.2, "bottom_depth": 12, "pulse_energy_mj": 0.0005, "layout": "32x32"}
 params |= {"paths_per_pass": 2**14, "photons_per_pass": 2**14}
@@ -21,8 +21,8 @@ frames = mitransient_lidar.record(stack, "icmos", shots=64, seed=1)
 print(f"{frames.sizes['frame']} frames, {frames.signal.dtype}; largest SNR of a pixel: {float(frames.snr.max()):.2f}")
 
 # %%
-# The gate with the mine's echo (above) and the gate with its shadow on the sand (below): photons of the light
-# without noise, one frame, and the mean of all frames.
+# The gate with the mine's echo (above) and the gate with its shadow on the sand (below). From left to right: photons
+# without noise, one frame, and the mean over all frames.
 
 photon = 6.626e-34 * 2.998e8 / 532e-9  # J
 half = 0.5 * float(stack.attrs["scene.field_of_view_mrad"])
@@ -67,6 +67,6 @@ right.legend()
 plt.show()
 
 # %%
-# **What to see.** A pixel has less than one photoelectron, so that a frame alone is mostly dark; the mean of 64 frames
-# shows the mine and, deeper, its shadow on the sand. The weights are negative there: the filter counts missing light.
-# Thus all gates together detect more than the best single gate.
+# **What to see.** A pixel has less than one photoelectron, so that a frame alone is mostly dark. The mean over 64
+# frames shows the mine and, deeper, its shadow on the sand. The weights are negative there: the filter counts missing
+# light. Thus all gates together detect more than the best single gate.

@@ -20,7 +20,7 @@ single = mitransient_lidar.render("fig15_1x1", params=flat, **options)
 four = mitransient_lidar.render("fig15_2x2", params=flat, **options)
 
 # %%
-# Local attenuation along the path: half the negative derivative of the logarithm of the power by the path in the water.
+# Local attenuation along the path: minus half the log power's derivative by the path in the water.
 
 SPEED = 0.299792458 / float(four.attrs["scene.group_index"])  # of light in the water, m/ns
 
@@ -50,6 +50,6 @@ lower.set(xlabel="time (ns)", ylabel="decay of the power (1/m)", xlim=(1425, 148
 plt.show()
 
 # %%
-# **What to see.** Above and below the boundary the power decays evenly, below more slowly. At the boundary it falls
-# to half, as the lower water scatters less, and this is a peak of the decay: first in the near pixels (blue, black),
-# four nanoseconds later in the far pixels. The peak of the single pixel lies between, and is lower and wider.
+# **What to see.** Above and below the boundary the power decays evenly, below more slowly. At the boundary it falls to
+# half, as the lower water scatters less. The decay then has a peak: first in the near pixels (blue, black), four
+# nanoseconds later in the far pixels. The single pixel's peak lies between, and is lower and wider.

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import mitransient_lidar
 
 # %%
-# A target of 1.5 m at 8 m, in the published scene with 2x2 pixels, here with one.
+# A 1.5 m target at 8 m, in the published scene with 2x2 pixels, here with one.
 
 shot = mitransient_lidar.render(
     "fig13_2x2", params={"layout": "1x1", "spectrum": "flat"}, components=True, passes=8, pass_share=1 / 8, seed=1
@@ -33,6 +33,6 @@ for origin in energy.origin.values:
 print(f"sum of the parts over all: {float(energy.sum()) / total:.6f}")
 
 # %%
-# **What to see.** The surface echo is lower than the light of the water that begins at the same time. The echo of the
-# target stands on the water column; behind it, rare paths make a noisy tail. The light of the water ends at the bottom.
-# The light of the bottom arrives until long after its echo, scattered on its way.
+# **What to see.** The surface echo is lower than the water's light that begins at the same time. The target echo stands
+# on the water column; behind it, rare paths make a noisy tail. The water's light ends at the bottom. The bottom's light
+# arrives until long after its echo, scattered on its way.

@@ -42,7 +42,7 @@ for grazing, rows in found.items():
         print(f"{height:4.0f} m, {grazing:4.1f} deg: {distance:4.0f} m, {target:.2e} J, {target / water:4.1f} x water")
 
 # %%
-# The geometry, and the energy of the target's echo over the distance through the air.
+# The geometry, and the target's echo energy over the distance through the air.
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", width_ratios=(1.5, 1))
 for number, (grazing, rows) in enumerate(found.items()):
@@ -59,5 +59,5 @@ plt.show()
 
 # %%
 # **What to see.** The distance through the air, left, grows as the angle falls: 319 m from 30 m at 5.4 degrees. There
-# the echo is 67 000 times weaker than from 5 m at 30 degrees: less light enters the water, and beam and view are wider
+# the echo is 67 000 times weaker than from 5 m at 30 degrees. Less light enters the water, and beam and view are wider
 # than the plate. It still has 11 times as much light as the water about it, and 26 to 150 times elsewhere.

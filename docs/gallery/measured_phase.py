@@ -53,8 +53,8 @@ with tempfile.TemporaryDirectory() as folder:
     }
 
 # %%
-# Integrals over the sphere, by the trapezoidal rule in fine steps: the integral of the table, which normalises it, and
-# the share of the backward hemisphere.
+# Integrals over the sphere, by the trapezoidal rule in fine steps: the table's integral, which normalises it, and the
+# backward hemisphere's share.
 
 theta = np.radians(np.geomspace(1e-3, 180, 20001))
 sine = 2 * np.pi * np.sin(theta) * np.exp(np.interp(np.log(theta), np.log(np.radians(angle)), np.log(value)))

@@ -15,7 +15,7 @@ import numpy as np
 import mitransient_lidar
 
 # %%
-# The map of this example is computed: a swell of 12 m length towards +x, with short crossing waves, in cells of 10 cm.
+# This example's map is computed: a 12 m long swell towards +x, with short crossing waves, in 10 cm cells.
 
 x = y = np.arange(-15, 15.05, 0.1)
 heights = 0.25 * np.sin(2 * np.pi * x / 12)[None, :] + 0.02 * np.cos(2 * np.pi * (x[None, :] + y[:, None]) / 2.1)

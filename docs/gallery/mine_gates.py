@@ -11,7 +11,7 @@ import numpy as np
 import mitransient_lidar
 
 # %%
-# 32x32 pixels instead of 128x128, and few passes: the grain of the images is the error of the render.
+# 32x32 pixels instead of 128x128, and few passes: the images' grain is the render's error.
 
 stack = mitransient_lidar.render("gated_mine", params={"layout": "32x32"}, passes=4, pass_share=1 / 2, seed=1)
 print("dimensions:", dict(stack.sizes))
@@ -19,7 +19,7 @@ error = (stack.gate_energy_stderr / stack.gate_energy).where(stack.gate_energy >
 print(f"standard error of a pixel in a gate (median): {100 * float(error.median()):.0f} %")
 
 # %%
-# Five gates of increasing depth on one scale, and the depth of the strongest echo of each pixel.
+# Five gates with increasing depth on one scale, and the depth of each pixel's strongest echo.
 
 depths = stack.gate_depth.values
 numbers = [int(np.abs(depths - depth).argmin()) for depth in (5.2, 5.8, 6.6, 7.4, 8.0)]
@@ -44,7 +44,7 @@ plt.show()
 print(f"shallowest echo {np.nanmin(depth):.2f} m, median {np.nanmedian(depth):.2f} m")
 
 # %%
-# **What to see.** Gates before the sphere show its top, then its disc in front of dark water. At 6.6 m only
-# water is visible. Deeper gates open on the plate (left), then on the sand, on which the sphere is a shadow. The
-# depth image shows the top of the sphere at 5.5 m, the plate just above the sand, and no depth (white) in some
-# pixels at the edge, which the beam hardly lights.
+# **What to see.** Gates before the sphere show its top, then its disc in front of dark water. At 6.6 m only water is
+# visible. Deeper gates open on the plate (left), then on the sand, on which the sphere is a shadow. The depth image
+# shows the sphere's top at 5.5 m and the plate just above the sand. Some pixels at the edge, which the beam hardly
+# lights, have no depth (white).

@@ -11,8 +11,8 @@ import numpy as np
 import mitransient_lidar
 
 # %%
-# The same receiver of 40 mrad with a beam of 0.5 mrad and one of 10 mrad. The bottom is at 16 m, and the lidar
-# looks 20 degrees off nadir.
+# The same 40 mrad receiver with a 0.5 mrad beam and a 10 mrad beam. The bottom is at 16 m, and the lidar looks 20
+# degrees off nadir.
 
 options = {"passes": 8, "pass_share": 1 / 4, "seed": 1}
 scene = {"layout": "1x1", "field_of_view_mrad": 40, "bottom_depth": 16, "spectrum": "flat"}
@@ -41,7 +41,7 @@ right.set(xlabel="depth (m)", ylabel="power (µW)")
 plt.show()
 
 # %%
-# **What to see.** The narrow beam has a surface echo, and a bottom echo that is half as high again and narrower: the
+# **What to see.** The narrow beam has a surface echo, and a bottom echo that is half as high again and narrower. The
 # wide beam's footprint, seen at 20 degrees, stretches both. Deep in the water the columns agree, as the view contains
-# both beams. The bottom echo of the narrow beam is wider than its pulse of 2 ns, 0.2 m on this axis, since the
-# water has spread it.
+# both beams. The narrow beam's bottom echo is wider than its 2 ns pulse, 0.2 m on this axis, since the water has spread
+# it.

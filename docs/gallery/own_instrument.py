@@ -14,7 +14,7 @@ import mitransient_lidar
 
 # %%
 # A small survey lidar at 120 m: a short pulse, a narrow beam and two columns of pixels. ``response_time_ns`` stays 0,
-# as the bandwidth of the amplifier below is the response.
+# as the amplifier's bandwidth below is the response.
 
 instrument = {
     "altitude": 120,
@@ -59,7 +59,7 @@ print(f"gain {float(recorded.gain):.3f}; saturated samples {100 * float(recorded
 print(f"best signal-to-noise ratio at the bottom: {float(recorded.snr.sel(time=slice(870, None)).max()):.0f}")
 
 # %%
-# Left the power in front of the detector, right one record of it.
+# Left the power in front of the detector, right one record.
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(7, 3), layout="constrained")
 for number, colour in enumerate(("tab:blue", "tab:orange")):
@@ -72,5 +72,5 @@ plt.show()
 
 # %%
 # **What to see.** On the logarithmic axis surface and water column are a slope, and the bottom a peak. In the record
-# the bottom is the highest sample, at nine tenths of the range of the digitiser: the gain is chosen for it. Eight
-# bits leave steps of 2 mV, and less than ten of them for the column just above the bottom.
+# the bottom is the highest sample, at nine tenths of the digitiser's range: the gain is chosen for it. Eight bits leave
+# steps of 2 mV, and less than ten of them for the column just above the bottom.

@@ -42,8 +42,7 @@ axes[1].legend(frameon=False)
 plt.show()
 
 # %%
-# **What to see.** Through the weaker filter the first photon of every shot comes with the first light of the surface.
-# The counter is then dead for 30 ns, counts once more in the column, and again 30 ns later: three groups that show the
-# dead time and not the sea. Through the stronger filter, surface and bottom are two peaks, with few counts after the
-# surface, as many shots have just counted it. The bottom is still too early, since the first photon of its echo
-# counts.
+# **What to see.** Through the weaker filter every shot's first photon comes with the first surface light. The counter
+# is then dead for 30 ns, counts once more in the column, and again 30 ns later. These three groups show the dead time
+# and not the sea. Through the stronger filter, surface and bottom are two peaks, with few counts after the surface, as
+# many shots have just counted it. The bottom is still too early, since the first photon of its echo counts.

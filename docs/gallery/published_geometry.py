@@ -12,8 +12,8 @@ import mitransient_lidar
 from mitransient_lidar.plots.palette import pixel_colours
 
 # %%
-# A layout is one parameter of the scene. All three renders have the same sea, with a wind of 3 m/s, and the same
-# passes: eight with a sixteenth of the usual number of paths.
+# A layout is one scene parameter. All three renders have the same sea, with 3 m/s wind, and the same passes: eight,
+# each with a sixteenth of the usual paths.
 
 shots = {
     layout: mitransient_lidar.render("table1", params={"layout": layout}, passes=8, pass_share=1 / 16, seed=1)
@@ -33,8 +33,8 @@ axes[0].set_ylabel("power (µW)")
 plt.show()
 
 # %%
-# The pixels share one circle, so that their energies add up to the energy of the single pixel within the errors of both
-# renders. Errors of pixels are added, as the pixels of one render share their photons.
+# The pixels share one circle, so that their energies add up to the single pixel's energy, within both renders' errors.
+# Pixel errors are added, as one render's pixels share their photons.
 
 single = shots["1x1"].impulse_response
 for layout in ("2x2", "1x4"):
@@ -47,5 +47,5 @@ for layout in ("2x2", "1x4"):
 
 # %%
 # **What to see.** Near pixels (blue, black) receive surface and bottom before the far pixels: their range is shorter.
-# The strips separate the echoes of the bottom further than the squares, and the outer strips, which are smaller,
-# receive less. The single pixel has the sum of all, with a longer rise of its bottom echo.
+# The strips separate the bottom echoes further than the squares, and the outer strips, which are smaller, receive less.
+# The single pixel has the sum of all, and its bottom echo rises longer.

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import mitransient_lidar
 
 # %%
-# Turbid water of c = 0.9 1/m and b = 0.7 1/m over a bottom at 6 m, one pixel of 30 mrad.
+# Turbid water with c = 0.9 1/m and b = 0.7 1/m over a bottom at 6 m, in one 30 mrad pixel.
 
 WATER = {"attenuation": 0.9, "scattering": 0.7, "backscattering": 0.014, "bottom_depth": 6}
 found = mitransient_lidar.scattering(

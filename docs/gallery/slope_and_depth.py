@@ -11,7 +11,7 @@ import numpy as np
 import mitransient_lidar
 
 # %%
-# Random places of one sea of 6 m/s, seen with 2x2 pixels. ``render_shots`` renders them together and adds the truth.
+# Random places on one sea at 6 m/s, seen with 2x2 pixels. ``render_shots`` renders them together and adds the truth.
 
 shots = mitransient_lidar.render_shots(
     "fig09_2x2",
@@ -57,6 +57,6 @@ plt.show()
 
 # %%
 # **What to see.** The retrieved slopes follow the true slopes, which are averages over the beam's footprint. Depths
-# through a level sea at its mean height (squares) scatter with the waves; corrected by the slope and the height of
-# the sea (circles) they scatter less, and lie some centimetres too deep, as scattered light arrives late. Bars are
-# stated standard errors.
+# through a level sea at its mean height (squares) scatter with the waves. Corrected by the sea's slope and height
+# (circles) they scatter less. They lie some centimetres too deep, as scattered light arrives late. Bars are stated
+# standard errors.

@@ -28,7 +28,7 @@ for correction in found.correction.values:
     print(f"{correction}: vertical uncertainty at 95 % {np.round(values, 1)} cm at {found.depth.values} m")
 
 # %%
-# Depths as measured, and corrected by the shipped table of the instrument's errors, with the limits of IHO S-44.
+# Depths as measured, and corrected by the shipped table for the instrument's errors, with the IHO S-44 limits.
 
 figure, axis = plt.subplots(figsize=(7, 3.6), layout="constrained")
 for correction in found.correction.values:

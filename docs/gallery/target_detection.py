@@ -12,8 +12,8 @@ import mitransient_lidar
 from mitransient_lidar.plots.palette import pixel_colours
 
 # %%
-# A square target of 1.5 m at 8 m, in the published scenes with 2x2 pixels and with four strips; with ``components`` the
-# light of the target is separate from the light of water and bottom.
+# A square 1.5 m target at 8 m, in the published scenes with 2x2 pixels and with four strips. With ``components`` the
+# target's light is separate from water and bottom light.
 
 options = {"components": True, "passes": 8, "pass_share": 1 / 4, "seed": 1}
 shots = {
@@ -22,9 +22,9 @@ shots = {
 }
 
 # %%
-# Where the shot noise of the backscatter limits, the variance of a pixel's noise is proportional to its backscatter B
-# in the gate of the echo E. The signal-to-noise ratio of a sum with weights w is then sum(w E) / sqrt(sum(w^2 B)),
-# which is largest for w = E/B.
+# Where the backscatter's shot noise limits, a pixel's noise variance is proportional to its backscatter B in the gate
+# with the echo E. The signal-to-noise ratio of a sum with weights w is then sum(w E) / sqrt(sum(w^2 B)), which is
+# largest for w = E/B.
 
 figure, axes = plt.subplots(1, 2, figsize=(7, 3.3), sharey=True, layout="constrained")
 for axis, (layout, shot) in zip(axes, shots.items(), strict=True):
@@ -47,7 +47,7 @@ axes[1].legend(frameon=False, fontsize="small")
 plt.show()
 
 # %%
-# **What to see.** Solid lines are the target, dotted ones all other light; the gate of the echo is grey. Of 2x2
-# pixels the near pixels (blue, black, one above the other) have nearly all of the echo. Of the strips the nearest
-# (black) has less of the echo than blue, but the best contrast, as little water is in its view at that time. Far
-# pixels add backscatter and no echo to a sum.
+# **What to see.** Solid lines are the target, dotted ones all other light; the echo's gate is grey. Among 2x2 pixels,
+# the near ones (blue, black, one above the other) have nearly all of the echo. The nearest strip (black) has less of
+# the echo than blue, but the best contrast, as little water is in its view at that time. Far pixels add backscatter and
+# no echo to a sum.

@@ -10,9 +10,9 @@ from them, and ends with a gated image.
 # 1. Render
 # ---------
 #
-# ``fig09_2x2`` is a shipped scene, the system of a published study: 5 mJ in 5 ns from 200 m, 20 degrees off nadir, 3
-# m/s of wind, a field of view of 30 mrad in 2x2 pixels. A render consists of independent passes; the spread of the
-# passes gives the standard error. With ``target_error=0.01`` instead of ``passes`` it stops at that accuracy.
+# ``fig09_2x2`` is a shipped scene, the system in a published study. It sends 5 mJ in 5 ns from 200 m, 20 degrees off
+# nadir, at 3 m/s wind, and sees 30 mrad in 2x2 pixels. A render consists of independent passes; their spread gives the
+# standard error. With ``target_error=0.01`` instead of ``passes`` it stops at that accuracy.
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -37,10 +37,10 @@ plt.show()
 
 # %%
 # From left to right: the surface comes first; the near pixels (blue, black) receive it 4 ns before the far pixels, as
-# their range is shorter. It is no spike: at this angle few facets reflect to the lidar, and the weak surface echo
-# merges with the backscatter of the water behind it. The straight line is the water column, steeper with more
-# attenuation. At 8 m the bottom echo rises above it. Bands of one standard error are drawn, too thin to
-# see before the last nanoseconds.
+# their range is shorter. It is no spike. At this angle few facets reflect to the lidar, and the weak surface echo
+# merges with the water's backscatter behind it. The straight line is the water column, steeper with more attenuation.
+# At 8 m the bottom echo rises above it. Bands of one standard error are drawn, too thin to see before the last
+# nanoseconds.
 #
 # 2. Receive
 # ----------
@@ -80,8 +80,9 @@ plt.show()
 # 3. Measure the echoes
 # ---------------------
 #
-# ``echoes`` returns surface, column, target and bottom echoes of every pixel and shot: time, depth, amplitude,
-# energy and width with their errors, and flags (0 without a problem), together with the attenuation of the column.
+# ``echoes`` returns surface, column, target and bottom echoes for every pixel and shot. They have time, depth,
+# amplitude, energy and width with their errors, and flags (0 without a problem). It also returns the column's
+# attenuation.
 
 echoes = mitransient_lidar.echoes(recorded)
 first = echoes.isel(shot=0).sel(echo=["surface", "bottom"])
@@ -89,8 +90,8 @@ columns = ["time_ns", "time_ns_stderr", "depth_m", "depth_m_stderr", "width_ns",
 print(first[columns].reset_coords(drop=True).to_dataframe().round(3).to_string())
 
 # %%
-# The flag 1 of the surfaces means that their echoes are weaker than three of their errors: at 3 m/s and 20 degrees most
-# facets reflect past the receiver. Their times are the starts of the column.
+# The surfaces' flag 1 means that their echoes are weaker than three of their errors. At 3 m/s and 20 degrees most
+# facets reflect past the receiver. Their times are the column's starts.
 #
 # Are the stated errors correct? Compare them with the spread over the 200 shots.
 
@@ -111,20 +112,20 @@ axis.legend(frameon=False)
 plt.show()
 
 # %%
-# The times of the bottom spread about as stated. The stated errors of the depths are about three times the spread of
-# the shots, on purpose: a depth is the time from the surface to the bottom, and the surface is the weaker echo. It
-# hardly exceeds the column, so that a surface with an echo and one without, a nanosecond apart in time, fit almost
-# equally well. The fit takes the mean over both and includes the difference in its error. This part is nearly the
-# same in every shot: it does not appear in the spread, and averaging shots does not remove it.
+# The bottom times spread about as stated. The depths' stated errors are about three times the shots' spread, on
+# purpose. A depth is the time from the surface to the bottom, and the surface is the weaker echo. It hardly exceeds the
+# column, so that a surface with an echo and one without, a nanosecond apart in time, fit almost equally well. The fit
+# takes the mean over both and includes the difference in its error. This part is nearly the same in every shot: it does
+# not appear in the spread, and averaging shots does not remove it.
 #
-# The groups also differ from the dashed line by centimetres: the waves over each pixel refract the beam and are
-# higher or lower than the mean sea, which the depth axis does not include.
+# The groups also differ from the dashed line by centimetres. The waves over each pixel refract the beam and are higher
+# or lower than the mean sea, which the depth axis does not include.
 #
 # 4. Retrieve
 # -----------
 #
 # ``retrieve`` combines the pixels. The truth is known here: the scene states bottom and water, and ``SeaMap`` has the
-# mean slope of the waves over the footprint.
+# waves' mean slope over the footprint.
 
 found = mitransient_lidar.retrieve(shot)
 sea = SeaMap.of_scene(mitransient_lidar.open_scene("fig09_2x2").scene)
@@ -147,10 +148,10 @@ print(f"c (1/m):        {value['attenuation']:.2f}, {low:.2f} to {high:.2f}    t
 # %%
 # How good are these estimates?
 #
-# - **Slope.** The wind of the scene is known: the estimate uses times and strengths of the surface echoes and the
-#   slopes that such a sea has. At 3 m/s these are 0.02 and 0.01, averaged over the footprint, and the column hides
-#   the surface echoes: the errors are hardly smaller than the slopes of the sea. Rougher seas give more: see
-#   :ref:`slopes of waves <sphx_glr_auto_gallery_slope_and_depth.py>`.
+# - **Slope.** The scene's wind is known: the estimate uses the surface echoes' times and strengths, and the slopes that
+#   such a sea has. At 3 m/s these are 0.02 and 0.01, averaged over the footprint, and the column hides the surface
+#   echoes. The errors are hardly smaller than the sea's slopes. Rougher seas give more: see :ref:`slopes of waves
+#   <sphx_glr_auto_gallery_slope_and_depth.py>`.
 # - **Depth** is within 0.15 m. Its error comes from the sea and the method, not from noise.
 # - **Absorption and backscattering** come within a few percent and the **reflectance** within a tenth, as
 #   efficiencies and the pulse's energy are known exactly here; the rest is light that the waves focus, which the
@@ -179,11 +180,10 @@ axes[0].set_ylabel("away from nadir (mrad)")
 plt.show()
 
 # %%
-# **What to see.** Left, the gate opens on the sphere: a disc on almost black water. Right, two metres deeper, it
-# opens on the sand: the disc has become a shadow, in the same place because laser and receiver are in the same place,
-# and next to it the plate is brightest. The far half is still dark: light of equal travel time lies on a sphere about
-# the lidar, which meets the near sand first. The grain of the pixels is the error of four passes; an image for a
-# report takes a minute.
+# **What to see.** Left, the gate opens on the sphere: a disc on almost black water. Right, two metres deeper, it opens
+# on the sand. The disc has become a shadow, in the same place because laser and receiver are in the same place. Next to
+# it the plate is brightest. The far half is still dark: light of equal travel time lies on a sphere about the lidar,
+# which meets the near sand first. The pixels' grain is the error of four passes; an image for a report takes a minute.
 #
 # What next
 # ---------

@@ -34,5 +34,5 @@ axis.legend(frameon=False)
 plt.show()
 
 # %%
-# **What to see.** More turbid water is brighter just below the surface and decays faster: the curves cross. The echo
-# of the bottom at 8 m is more than a hundred times higher in IB than in 5C, where it hardly rises above the water.
+# **What to see.** More turbid water is brighter just below the surface and decays faster: the curves cross. The bottom
+# echo at 8 m is more than a hundred times higher in IB than in 5C, where it hardly rises above the water.

@@ -14,7 +14,7 @@ import numpy as np
 import mitransient_lidar
 
 # %%
-# The cast of this example is computed: clear water above, and turbid water below 4.5 m.
+# This example's cast is computed: clear water above, and turbid water below 4.5 m.
 
 depth = np.linspace(0, 12, 49)
 turbid = 1 / (1 + np.exp(-(depth - 4.5) / 0.4))
@@ -50,5 +50,5 @@ plt.show()
 
 # %%
 # **What to see.** The backscatter rises between 3 and 5 m, where the turbid water begins, and then falls more steeply
-# than above. The bottom echo at 8 m follows. The layers (grey) follow the profile. The pulse of 5 ns, and the
-# beam of 10 mrad at 20 degrees, make the rise of the waveform longer than the rise of the profile.
+# than above. The bottom echo at 8 m follows. The layers (grey) follow the profile. The 5 ns pulse, and the 10 mrad beam
+# at 20 degrees, make the waveform rise longer than the profile.

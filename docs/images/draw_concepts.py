@@ -1,6 +1,6 @@
 """Draws the pictures of docs/concepts.md: ``python docs/images/draw_concepts.py [FOLDER]``, some seconds.
 
-Directions, pixels and the record are those of the program: rays are refracted by `physics.lidar`, pixels come from the
+Directions, pixels and the record are the program's own. Rays are refracted by `physics.lidar`, pixels come from the
 plugin ``multipixel_receiver``, and the record is a render.
 """
 
@@ -115,7 +115,7 @@ def draw_frame(path: Path) -> None:
 
 
 def draw_pixels(path: Path) -> None:
-    """Draw the pixels of four layouts as the lidar sees them."""
+    """Draw the pixels in four layouts as the lidar sees them."""
     import mitsuba as mi
 
     from mitransient_lidar.transport.sensor.outlines import pixel_outlines
@@ -133,7 +133,7 @@ def draw_pixels(path: Path) -> None:
             for loop in loops:
                 ax.add_patch(Polygon(1e3 * loop[:, ::-1], facecolor=colour, alpha=0.35, edgecolor="white"))
             label = f"{index}\n{NAMES[index]}" if pixels.count == 4 else f"{index}"
-            label = f"{index // 6}, {index % 6}" if layout == "4x6" else label
+            label = f"{index // 6},{index % 6}" if layout == "4x6" else label
             ax.text(centre[1], centre[0], label, ha="center", va="center", fontsize=9)
         ax.set_title(f"{layout}: row, column" if layout == "4x6" else layout, fontsize="medium")
         ax.set(xlim=(16.5, -16.5), ylim=(-16.5, 16.5), aspect="equal", xlabel="left, angle_y (mrad)")
@@ -142,7 +142,7 @@ def draw_pixels(path: Path) -> None:
 
 
 def draw_widths(path: Path) -> None:
-    """Draw the definitions of the width of a beam, and a pulse in bins."""
+    """Draw how a beam's width is defined, and a pulse in bins."""
     figure = drawing.new_figure(path, 11, 3.6)
     beam, pulse = figure.subplots(1, 2)
     sigma = 5.0
@@ -153,7 +153,7 @@ def draw_widths(path: Path) -> None:
         half = sigma * np.sqrt(-2 * np.log(level))
         arrow(beam, (-half, level), (half, level), DIM, both=True)
         beam.text(half + 1, level, f"{name}, {2 * half:.1f} mrad", fontsize=9, va="center")
-    beam.set(xlabel="angle from the axis (mrad)", ylabel="irradiance over its peak", xlim=(-16, 40), ylim=(0, 1.08))
+    beam.set(xlabel="angle from the axis (mrad)", ylabel="irradiance over its peak", xlim=(-16, 57), ylim=(0, 1.08))
     beam.set_title("One Gaussian beam and its three widths")
 
     fwhm, width = 5.0, 1.0
@@ -175,7 +175,7 @@ def draw_widths(path: Path) -> None:
 
 
 def draw_record(path: Path) -> None:
-    """Draw the record of one pixel over a level sea: energy by bin and power after the pulse, with both axes."""
+    """Draw one pixel's record over a level sea: energy by bin and power after the pulse, with both axes."""
     params = {"layout": "1x1", "spectrum": "flat"}
     shot = mitransient_lidar.render("table1", params=params, passes=64, seed=1).isel(pixel=0)
     figure = drawing.new_figure(path, 11, 4.2)

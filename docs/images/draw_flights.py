@@ -35,7 +35,7 @@ _GREY, _BLUE, _GREEN, _RED = palette.GREY, palette.BLUE, palette.GREEN, palette.
 
 
 def main(path: Path) -> None:
-    """Draw the axes, and the signs of yaw, roll, pitch and the angles of a scanner, as the flights have them."""
+    """Draw the axes, and the signs for yaw, roll, pitch and a scanner's angles, as the flights have them."""
     figure = drawing.new_figure(path, 8.5, 8.5)
     above, behind, side, scan = figure.subplots(2, 2).ravel()
 
@@ -77,7 +77,7 @@ def main(path: Path) -> None:
 
 
 def _draw_scanner(ax: Axes) -> None:
-    """Draw a beam of a scanner in its frame, in an oblique view from behind and above on the right."""
+    """Draw a scanner's beam in its frame, in an oblique view from behind and above on the right."""
     to_view = np.array([(0.9, 0.42, 0.0), (-0.28, 0.5, 0.82)])
     axis, far, left = (
         to_view @ one[0] for one in Fixed(nadir_angle_deg=_NADIR_ANGLE, azimuth_deg=_AZIMUTH).directions([0])
@@ -116,12 +116,12 @@ def _view(ax: Axes, title: str, labels: tuple[str, str]) -> Axes:
 
 
 def _turned(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> FloatArray:
-    """Return the matrix of an attitude [deg]."""
+    """Return an attitude's matrix [deg]."""
     return rotation_matrices(roll, pitch, yaw)
 
 
 def _seen(view: tuple[int, int], turn: FloatArray, vector: npt.ArrayLike) -> FloatArray:
-    """Return a vector of the platform in a view."""
+    """Return a platform vector in a view."""
     return np.asarray(turn @ np.asarray(vector, dtype=np.float64))[list(view)]
 
 
@@ -143,7 +143,7 @@ def _arrow(ax: Axes, start: npt.ArrayLike, end: npt.ArrayLike, colour: str, name
 
 
 def _arc(ax: Axes, first: float, last: float, radius: float, name: str) -> None:
-    """Draw the arc of an angle, from one direction on the page to another [deg], with an arrow at its end."""
+    """Draw an angle's arc, from one direction on the page to another [deg], with an arrow at its end."""
     angle = np.radians(np.linspace(first, last, 41))
     line = radius * np.column_stack([np.cos(angle), np.sin(angle)])
     ax.plot(*line[:-1].T, color=_RED)

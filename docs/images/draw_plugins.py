@@ -1,4 +1,4 @@
-"""Draw the pictures of the plugins' pages: ``python docs/images/draw_plugins.py [NAME ...]``.
+"""Draw the pictures for the plugins' pages: ``python docs/images/draw_plugins.py [NAME ...]``.
 
 The example on each page is completed to a scene by the defaults of the other plugins, rendered, and drawn to
 ``docs/images/plugins``. Most of the time is spent on compiling kernels.
@@ -33,7 +33,7 @@ _IMAGER = """<string name="layout" value="96x96"/><float name="field_of_view_mra
 
 
 def draw(plugin: Plugin, work: Path) -> None:
-    """Render and draw the example of a plugin."""
+    """Render and draw a plugin's example."""
     angles = np.r_[0.1, 1:181]
     table = work / "harbour.csv"  # the file that the example of measured_phase reads: scattering by pure sea water
     np.savetxt(table, np.c_[angles, 0.0623 * (1 + 0.835 * np.cos(np.radians(angles)) ** 2)], delimiter=",")
@@ -52,7 +52,7 @@ def draw(plugin: Plugin, work: Path) -> None:
 
 
 def complete_scene(plugin: Plugin, xml: str) -> str:
-    """Return the scene of an example: the rest has the defaults of the plugins."""
+    """Return an example's scene: the rest has the plugins' defaults."""
     by_day, kind = plugin.name in DAYLIGHT, plugin.kind
     phase = xml if kind == "phase" else ""
     water = xml if kind == "medium" else f'<medium type="layered_water" name="interior">{phase}</medium>'
@@ -73,7 +73,7 @@ def complete_scene(plugin: Plugin, xml: str) -> str:
 
 
 def draw_phase_function(name: str, xml: str, path: Path) -> None:
-    """Draw the phase function of an example, evaluated by the plugin."""
+    """Draw an example's phase function, evaluated by the plugin."""
     phase = mi.load_string(re.sub("^<phase ", '<phase version="3.0.0" ', xml))
 
     def value(theta: np.ndarray) -> np.ndarray:
@@ -86,14 +86,14 @@ def draw_phase_function(name: str, xml: str, path: Path) -> None:
 
 
 def reduce_colours(path: Path) -> None:
-    """Write a picture again with 64 colours and 900 pixels of width: a quarter of its size."""
+    """Write a picture again with 64 colours, 900 pixels wide: a quarter of its size."""
     with Image.open(path) as picture:
         scaled = picture.convert("RGB").resize((900, round(900 * picture.height / picture.width)), Image.LANCZOS)
     scaled.quantize(64, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def main(names: list[str]) -> None:
-    """Draw the pictures of some plugins, or of all."""
+    """Draw the pictures for some plugins, or for all."""
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as work:
         for plugin in plugins():

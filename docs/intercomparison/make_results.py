@@ -51,7 +51,7 @@ FIRST_SEA = {"lidar_merging": 1, "lidar_volpath": 1001}
 
 
 def read_cases() -> dict[str, dict[str, str]]:
-    """Return the parameters of each case, as text; those that a case does not use are left out."""
+    """Return each case's parameters, as text; parameters that a case does not use are left out."""
     with (HERE / "cases.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     names = [name for name in rows[0] if name not in ("parameter", "unit", "meaning")]
@@ -64,7 +64,7 @@ def gate_edges(case: dict[str, str]) -> npt.NDArray[np.float64]:
 
 
 def exchanged(text: str) -> tuple[str, float]:
-    """Return a scene with the angles of beam and view exchanged, and the factor of its energies."""
+    """Return a scene with beam and view angles exchanged, and its energies' factor."""
     angles = [re.search(rf'"{key}" value="([^"]*)"', text) for key in ("divergence_mrad", "field_of_view_mrad")]
     beam, view = (float(found[1]) for found in angles if found)
     for key, value in (("divergence_mrad", view), ("field_of_view_mrad", beam)):
@@ -73,7 +73,7 @@ def exchanged(text: str) -> tuple[str, float]:
 
 
 def render(name: str, integrator: str, passes: int = PASSES) -> npt.NDArray[np.float64]:
-    """Return the energies of independent passes [J], shape (passes, gates)."""
+    """Return independent passes' energies [J], shape (passes, gates)."""
     path, factor = HERE / "cases" / f"{name}.xml", 1.0
     with tempfile.TemporaryDirectory() as folder:
         if integrator == "lidar_volpath" and name in EXCHANGED:
@@ -85,7 +85,7 @@ def render(name: str, integrator: str, passes: int = PASSES) -> npt.NDArray[np.f
 
 
 def render_file(path: Path, integrator: str, name: str, passes: int) -> npt.NDArray[np.float64]:
-    """Return the energies of passes of a scene file [J], shape (passes, gates), with the options of a case."""
+    """Return the energies [J] in a scene file's passes, shape (passes, gates), with a case's options."""
     options = {"type": integrator, **INTEGRATORS[integrator], **OPTIONS.get((name, integrator), {})}
     renderer, found = None, []
     for number in range(passes):

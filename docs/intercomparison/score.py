@@ -1,4 +1,4 @@
-"""Score the results of a model against the reference of the intercomparison.
+"""Score a model's results against the reference in the intercomparison.
 
 ``python docs/intercomparison/score.py MY_RESULTS [--reference docs/intercomparison/results/lidar_merging]`` reads
 ``CASE.csv`` of both folders, prints a table and draws ``MY_RESULTS/score.png``. It needs NumPy and matplotlib.
@@ -27,7 +27,7 @@ LIMIT = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Energies of gates and their standard errors [J], and edges of the gates [ns], shape (gates,)."""
+    """Gate energies and their standard errors [J], and gate edges [ns], shape (gates,)."""
 
     start: FloatArray
     end: FloatArray
@@ -42,16 +42,16 @@ class Score:
     Attributes
     ----------
     gates, all_gates
-        Number of gates that count, and of all gates.
+        Number of gates that count, and all gates' number.
     rms
-        Root-mean-square relative difference of a gate [1]; both results' random errors are part of it.
+        A gate's root-mean-square relative difference [1]; both results' random errors are part of it.
     bias
-        Relative difference of the sums over these gates [1].
+        Relative difference between the sums over these gates [1].
     bias_bound
-        Largest standard error of the bias [1]: that of gates whose errors are fully correlated.
+        Largest standard error of the bias [1]: with fully correlated gate errors.
     chi_squared
-        Mean over gates of the squared difference over the sum of both variances [1]: 1 for results that agree, also if
-        their gates are correlated; infinite if a gate without errors differs.
+        Mean over gates: squared difference divided by the sum of both variances [1]. It is 1 for results that agree,
+        also if their gates are correlated, and infinite if a gate without errors differs.
     worst_gate
         Number of the gate with the largest difference in standard errors, from 0.
     worst_z
@@ -99,12 +99,12 @@ def read(path: Path) -> Result:
 
 
 def score(result: Result, reference: Result) -> Score:
-    """Return the score of a result against the reference of the same case.
+    """Return a result's score against the reference for the same case.
 
     Raises
     ------
     ValueError
-        If the gates differ by more than 0.001 of their width, or no gate of the reference is known.
+        If the gates differ by more than 0.001 of their width, or no reference gate is known.
     """
     width = reference.end - reference.start
     same = result.start.shape == reference.start.shape and all(

@@ -1,8 +1,8 @@
 """Closed-form single scattering: an example of a model that takes part, in NumPy alone.
 
 ``python docs/intercomparison/single_scattering.py -o my_results`` writes ``my_results/CASE.csv`` for every case. Light
-scatters once in the water, or is reflected once by the bottom, and returns along its own ray through a level surface;
-every other scattering event is a loss. Waves, targets and all light of more scatterings are left out, so that this
+scatters once in the water, or is reflected once by the bottom, and returns along its own ray through a level surface.
+Every other scattering event is a loss. Waves, targets and all light with more scatterings are left out, so that this
 model is right in the case ``single_scattering`` alone.
 """
 
@@ -27,7 +27,7 @@ RADII, AZIMUTHS, REACH, DEPTHS = 96, 192, 6.0, 6
 
 
 def read_cases() -> dict[str, Case]:
-    """Return the parameters of each case, as text; those that a case does not use are left out."""
+    """Return each case's parameters, as text; parameters that a case does not use are left out."""
     with (HERE / "cases.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     names = [name for name in rows[0] if name not in ("parameter", "unit", "meaning")]
@@ -50,7 +50,7 @@ def numbers(text: str) -> FloatArray:
 
 
 def rays(case: Case) -> tuple[FloatArray, FloatArray]:
-    """Return angles from the vertical [rad] and weights [1] of rays of the beam within the field of view."""
+    """Return angles from the vertical [rad] and weights [1] for beam rays within the field of view."""
     width, view = 1e-3 * float(case["divergence_mrad"]) / 2, 1e-3 * float(case["field_of_view_mrad"]) / 2
     gaussian = case["beam_profile"] == "gaussian"
     end = min(view, REACH * width if gaussian else width)
@@ -74,7 +74,7 @@ def transmittance(theta: FloatArray, phi: FloatArray, index: float) -> FloatArra
 
 
 def energies(case: Case) -> FloatArray:
-    """Return the energy [J] of each gate, shape (gates,)."""
+    """Return each gate's energy [J], shape (gates,)."""
     height, index, group = (float(case[key]) for key in ("altitude", "refractive_index", "group_index"))
     edges = float(case["time_start_ns"]) + float(case["bin_width_ns"]) * np.arange(int(case["bin_count"]) + 1)
     tops, attenuation, scattering = (numbers(case[key]) for key in ("layer_tops", "attenuation", "scattering"))
@@ -89,7 +89,7 @@ def energies(case: Case) -> FloatArray:
         return np.sum(attenuation * (np.clip(z[..., None], tops, ends) - tops), axis=-1)
 
     def solid_angle(z: FloatArray) -> FloatArray:
-        """Return the solid angle in the water over the area of the aperture [1/m^2], for rays along the last axis."""
+        """Return the solid angle in the water over the aperture's area [1/m^2], for rays along the last axis."""
         radius = height * np.tan(theta) + z * np.tan(phi)
         spread = height / np.cos(theta) ** 2 + z * np.cos(theta) / (index * np.cos(phi) ** 3)
         # sin(theta) over the radius, which both are 0 at nadir.
@@ -120,7 +120,7 @@ def energies(case: Case) -> FloatArray:
 
 
 def write(path: Path, case: Case) -> None:
-    """Write the energies of a case; they have no random error."""
+    """Write a case's energies; they have no random error."""
     start, width = float(case["time_start_ns"]), float(case["bin_width_ns"])
     found = energies(case)
     edges = start + width * np.arange(len(found) + 1)
@@ -131,7 +131,7 @@ def write(path: Path, case: Case) -> None:
 
 
 def main() -> None:
-    """Write the results of all cases."""
+    """Write all cases' results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for CASE.csv")
     options = parser.parse_args()

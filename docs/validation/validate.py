@@ -1,8 +1,8 @@
 """Compare the package with closed forms, exact solutions, published values and measurements.
 
-``python docs/validation/validate.py [CASE ...] -o docs/validation`` computes the cases, by default all of them, and
-writes them into ``cases.csv``, the table of ``index.md`` (made where it is missing) and the figures; rows of other
-cases stay. The closed forms and scenes are those of ``tests``.
+``python docs/validation/validate.py [CASE ...] -o docs/validation`` computes the cases, by default all. It writes them
+into ``cases.csv``, the ``index.md`` table (made where it is missing) and the figures; other cases' rows stay. The
+closed forms and scenes are in ``tests``.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ BEGIN, END = "<!-- table by validate.py -->", "<!-- end of the table -->"
 
 @dataclass(frozen=True)
 class Row:
-    """A comparison: our value with its standard error (0 for a closed form of ours), and theirs."""
+    """A comparison: our value with its standard error (0 for our closed form), and theirs."""
 
     quantity: str
     unit: str
@@ -59,7 +59,7 @@ class Row:
     source: str
 
     def text(self, case: str) -> dict[str, str]:
-        """Return the row as text by column; without an error of ours there is no z."""
+        """Return the row as text by column; without our error there is no z."""
         z = f"{(self.ours - self.theirs) / self.error:+.1f}" if self.error else ""
         numbers = f"{self.ours:.5g}", f"{self.error:.2g}" if self.error else "", f"{self.theirs:.5g}"
         ratio = f"{self.ours / self.theirs:.4f}"
@@ -67,19 +67,19 @@ class Row:
 
 
 def row(quantity: str, unit: str, samples: FloatArray, theirs: float, source: str) -> Row:
-    """Return the row of independent passes, shape (passes,)."""
+    """Return the row for independent passes, shape (passes,)."""
     samples = np.asarray(samples, dtype=np.float64)
     return Row(quantity, unit, samples.mean(), samples.std(ddof=1) / np.sqrt(len(samples)), float(theirs), source)
 
 
 def passes(scene: Any, count: int, **options: Any) -> FloatArray:
-    """Return the energies of independent passes [J], shape (passes, pixels and classes, bins)."""
+    """Return independent passes' energies [J], shape (passes, pixels and classes, bins)."""
     renderer = scene.integrator().prepare(scene, scene.sensors()[0], **options)
     return np.array([renderer.render_pass(seed).histogram.energy() for seed in range(count)])
 
 
 def levels() -> list[Row]:
-    """Levels of surface, column and bottom of both integrators: 20 degrees, 200 m, beam of 10 and view of 30 mrad."""
+    """Surface, column and bottom levels by both integrators: 20 degrees, 200 m, 10 mrad beam, 30 mrad view."""
     system = LidarSystem(200.0, np.radians(20.0), 1.34, 1.34, energy=5e-3 * 0.81 * 0.9, aperture_area=0.025)
     sigma, depth, rho, edges = 5e-3, 8.0, 0.1, 1390.0 + np.arange(161)
     seen = lambda x, y: np.hypot(x, y) < 15e-3  # noqa: E731
@@ -130,12 +130,12 @@ def half_spaces() -> list[Row]:
 
 
 def passes_of_pixels(scene: Any, count: int) -> FloatArray:
-    """Return the energies of passes, as the fixture of the tests."""
+    """Return the passes' energies, like the tests' fixture."""
     return passes(scene, count)
 
 
 def slab() -> list[Row]:
-    """Light that crosses a slab of optical thickness 2, and that it reflects."""
+    """Light that crosses a slab with optical thickness 2, and light that it reflects."""
     system = partial(beams.parts_of, conftest._build)
     parts = system({**beams.MATCHED, **beams.SLAB}, bottom=21.0, rho=0.0)
     down, up = beams.fluxes(parts, [1e-3, 20.0], 2**16, 16)
@@ -159,7 +159,7 @@ def moments() -> list[Row]:
 
 
 def scenes() -> list[Row]:
-    """Light by origin of both integrators in random scenes, with the passes of a confirmation."""
+    """Light by origin, from both integrators in random scenes, with a confirmation's passes."""
     found = []
     for number in range(RANDOM_SCENES):
         for origin, gate, difference, error, _ in random_scenes.compare(*random_scenes.draw(number), confirming=True):
@@ -229,10 +229,10 @@ SUN, SUN_RADIUS = np.radians(31.5), 4.65e-3
 
 
 def flicker() -> list[Row]:
-    """Coefficient of variation of unscattered sunlight below Gaussian waves, in closed form.
+    """Coefficient of variation for unscattered sunlight below Gaussian waves, in closed form.
 
-    The mean square irradiance over the squared mean is the enhancement of light that crosses the sea twice, whose way
-    back has the waves of another ray of the sun's disc.
+    The mean square irradiance over the squared mean is the enhancement of light that crosses the sea twice. Its way
+    back has the waves of another ray from the sun's disc.
     """
     depth = np.array(list(FLICKER))
     quantiles = (np.arange(12) + 0.5) / 12
@@ -271,7 +271,7 @@ CASES: dict[str, Callable[[], list[Row]]] = {
 
 
 def read(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a table, none if there is no file."""
+    """Return a table's rows, none if there is no file."""
     if not path.is_file():
         return []
     with path.open(newline="") as file:
@@ -286,7 +286,7 @@ def markdown(rows: list[dict[str, str]]) -> str:
 
 
 def draw(rows: list[dict[str, str]], path: Path) -> None:
-    """Draw the ratios of rows with errors, and the variation under waves by depth."""
+    """Draw the ratios for rows with errors, and the variation under waves by depth."""
     from mitransient_lidar.plots import drawing, palette
 
     known = [row for row in rows if row["error"]]

@@ -99,11 +99,11 @@ def read_instrument(name: str) -> Instrument:
 def with_infrared(
     name: str | None, params: Mapping[str, Any] | None
 ) -> tuple[tuple[str, dict[str, Any]], tuple[str, dict[str, Any]]]:
-    """Return names and parameters of the green and of the infrared channel of an instrument.
+    """Return names and parameters for an instrument's green and infrared channels.
 
-    The infrared channel is an instrument of the same name with the end ``_infrared``. Parameters of the scene, the
-    altitude and the aim are those of both channels, ``infrared.NAME`` is the parameter ``NAME`` of the infrared one
-    alone, and others of the lidar are those of the green one. Coefficients of the water are at 532 nm.
+    The infrared channel is an instrument of the same name with the end ``_infrared``. Both channels share the scene's
+    parameters, the altitude and the aim. ``infrared.NAME`` is the parameter ``NAME`` for the infrared channel alone;
+    other lidar parameters are the green channel's. Coefficients of the water are at 532 nm.
 
     Raises UserError if there is no such instrument, or it has no infrared channel.
     """

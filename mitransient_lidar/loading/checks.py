@@ -1,8 +1,8 @@
 """Checks of scene values, PLY files and grids before Mitsuba reads them: it trusts their counts and face indices.
 
-A PLY file (Turk, 1994, "The PLY polygon file format") has a header that lists elements with counts and properties, and
-their values as text or as binary records. Mitsuba reads lists of three alone, so that all records of an element have
-one length, and names the vertices ``vertex`` and the triangles ``face``.
+A PLY file (Turk, 1994, "The PLY polygon file format") has a header that lists elements with counts and properties.
+Their values follow as text or as binary records. Mitsuba reads lists of three alone, so that all records for an element
+have one length. It names the vertices ``vertex`` and the triangles ``face``.
 """
 
 from __future__ import annotations

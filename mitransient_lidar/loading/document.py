@@ -1,8 +1,8 @@
 """XML scene documents: an element tree without includes, its parameters, and its attribute values.
 
-A scene goes one way: a document is read from a file or a source, an instrument may be mounted (`catalogue.mount`),
-its parameters are filled (`parameters.fill`), its values are checked (`checks.check`) and recorded (`scene_source`),
-and Mitsuba loads it (`scenes.open_scene`). Each step takes the previous step's document.
+A scene goes one way. A document is read from a file or a source, and an instrument may be mounted (`catalogue.mount`).
+Its parameters are filled (`parameters.fill`), its values checked (`checks.check`) and recorded (`scene_source`), and
+Mitsuba loads it (`scenes.open_scene`). Each step takes the previous step's document.
 """
 
 from __future__ import annotations

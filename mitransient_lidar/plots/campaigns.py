@@ -38,8 +38,8 @@ _DONE = 1
 def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, seed: int = 0) -> Figure:
     """Draw a campaign.
 
-    Above: a random sample of records, the first pixel of each. In the middle: the parameter distributions. Below, over
-    parameter pairs: the mean over runs of the share of records with a bottom echo, else of the peak power, else of the
+    Above: randomly sampled records, each record's first pixel. In the middle: the parameter distributions. Below, over
+    parameter pairs: the mean over runs, for the share of records with a bottom echo, else for peak power, else for the
     error.
 
     Raises UserError if no run is done, or the file name has another suffix.
@@ -64,7 +64,7 @@ def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, see
 
 
 def _inputs(dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> dict[str, npt.NDArray[Any]]:
-    """Return the parameters of runs, by name, those that vary and follow from no others."""
+    """Return the run parameters, by name, that vary and follow from no others."""
     given = json.loads(dataset.attrs.get("campaign", "{}")).get("parameters", {})
     found = {name: dataset[stored].values[runs] for name, stored in dict(dataset.attrs.get("inputs", {})).items()}
     return {
@@ -75,7 +75,7 @@ def _inputs(dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> dict[str, npt.ND
 
 
 def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> None:
-    """Draw the records of runs."""
+    """Draw the runs' records."""
     name = next((name for name in ("signal", "waveform") if name in dataset), None)
     if name is None:
         ax.text(0.5, 0.5, "no records are kept", ha="center", va="center")
@@ -172,7 +172,7 @@ def _response(dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> tuple[FloatArr
 
 
 def _set_scale(scale: Callable[[str], Any], axis: Axis, column: npt.NDArray[Any]) -> None:
-    """Draw an axis of values in their logarithms where they are spread so, with plain numbers."""
+    """Draw a value axis in logarithms where they are spread so, with plain numbers."""
     if _is_logarithmic(column):
         scale("log")
         drawing.plain_logarithms(axis)
@@ -185,7 +185,7 @@ def _is_logarithmic(column: npt.NDArray[Any]) -> bool:
 
 
 def _edges(column: npt.NDArray[Any]) -> FloatArray:
-    """Return cell edges: about each of few values, or even ones over the range of many."""
+    """Return cell edges: about each value if they are few, else even ones over their range."""
     values = np.unique(column).astype(np.float64)
     if values.size <= _CELLS:
         middle = 0.5 * (values[1:] + values[:-1])

@@ -1,4 +1,4 @@
-"""Elements shared by all figures: file, sizes of texts, legends, units, titles, axes and images."""
+"""Elements shared by all figures: file, text sizes, legends, units, titles, axes and images."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class _PageFigure(Figure):
 
 
 def make_legible(figure: Figure, renderer: Any) -> None:
-    """Enlarge the texts of a figure to 7 pt at the width of a page, and move legends from data to the right."""
+    """Enlarge a figure's texts to 7 pt at a page's width, wrap its title, and move legends from data to the right."""
     least = _LEAST_POINTS * figure.get_figwidth() / _PAGE_INCHES
     for ax in [one for parent in figure.axes for one in (parent, *parent.child_axes)]:
         for axis in (ax.xaxis, ax.yaxis):
@@ -64,6 +64,8 @@ def make_legible(figure: Figure, renderer: Any) -> None:
                 axis.set_tick_params(which="both", labelsize=least)
     for text in figure.findobj(Text):
         text.set_fontsize(max(float(text.get_fontsize()), least))
+    for text in figure.texts:
+        text.set_wrap(not text.get_rotation())
     legends = [(ax, legend) for ax in figure.axes if (legend := ax.get_legend())]
     if legends and (layout := figure.get_layout_engine()):
         layout.execute(figure)
@@ -74,7 +76,7 @@ def make_legible(figure: Figure, renderer: Any) -> None:
 
 
 def _hides_data(ax: Axes, box: Bbox) -> bool:
-    """Return whether a box of the canvas covers parts of lines, points, bars or bands."""
+    """Return whether a canvas box covers parts of lines, points, bars or bands."""
     for line in ax.lines:
         path = line.get_transform().transform_path(line.get_path()).cleaned(remove_nans=True)
         if np.size(path.vertices) and path.intersects_bbox(box, filled=False):
@@ -114,7 +116,7 @@ def save(figure: Figure, path: FilePath | None) -> Figure:
 
 
 def _save_png(figure: Figure, path: Path) -> None:
-    """Write the file of `figure.savefig`, which draws a figure twice, in three quarters of its time."""
+    """Write `figure.savefig`'s file in three quarters of its time: it draws a figure twice."""
     resolution = figure.dpi
     figure.dpi = _DPI
     try:
@@ -132,18 +134,18 @@ def si_prefix(largest: float) -> tuple[float, str]:
 
 
 def scene_name(attributes: Mapping[str, Any]) -> str:
-    """Return the name of the scene or of recorded waveforms without suffix, and the instrument; empty if unknown."""
+    """Return the scene's or recorded waveforms' name without suffix, and the instrument; empty if unknown."""
     names = Path(str(attributes.get("scene", attributes.get(FILE, "")))).stem, str(attributes.get("instrument", ""))
     return ", ".join(filter(None, names))
 
 
 def time_label(dataset: xr.Dataset) -> str:
-    """Return what times of a dataset count from."""
+    """Return what a dataset's times count from."""
     return _RECORD_TIME if FILE in dataset.attrs and not dataset.attrs["time_start_ns"] else TIME_LABEL
 
 
 def titled(attributes: Mapping[str, Any], text: str) -> str:
-    """Return a title that begins with the name of the scene, if known."""
+    """Return a title that begins with the scene's name, if known."""
     scene = scene_name(attributes)
     return f"{scene}: {text}" if scene else text
 
@@ -161,7 +163,7 @@ def time_limits(dataset: xr.Dataset) -> tuple[float, float]:
 
 
 def add_grid(ax: Axes, axis: Literal["both", "x", "y"] = "both", hide: tuple[str, ...] = ()) -> None:
-    """Draw light grid lines at the major ticks, below all curves, and hide sides of the frame."""
+    """Draw light grid lines at the major ticks, below all curves, and hide frame sides."""
     ax.grid(True, which="major", axis=axis, color="0.9", linewidth=0.7)
     ax.set_axisbelow(True)
     for side in hide:
@@ -176,7 +178,7 @@ def plain_logarithms(axis: Any) -> None:
 
 
 def outline_patch(loops: Sequence[FloatArray], **style: Any) -> PathPatch:
-    """Return the shape of a pixel, given its closed lines (x, y): as one patch, they keep holes open."""
+    """Return a pixel's shape, given its closed lines (x, y): as one patch, they keep holes open."""
     return PathPatch(Line.make_compound_path(*(Line(loop, closed=True) for loop in loops)), **style)
 
 
@@ -193,7 +195,7 @@ def draw_band(
 ) -> None:
     """Draw a curve with a band of +-`error`, cut off at `lowest`, since a logarithmic axis has no values below 0.
 
-    An error of shape (2, len(x)) is that below and above the curve.
+    An error with the shape (2, len(x)) is for below and above the curve.
     """
     (line,) = ax.plot(x, y, **style)
     below, above = np.broadcast_to(error, (2, len(y)))
@@ -223,7 +225,7 @@ def as_seen(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def image_extent(dataset: xr.Dataset) -> tuple[float, float, float, float]:
-    """Return the edges of an image [mrad]: left, the largest angle_y, right, near and far."""
+    """Return an image's edges [mrad]: left, the largest angle_y, right, near and far."""
     angle_x, angle_y = dataset["angle_x"].values, dataset["angle_y"].values
     along, across = (0.5 * pitch for pitch in pixel_pitch(dataset))
     left, right = float(angle_y.max() + across), float(angle_y.min() - across)
@@ -231,7 +233,7 @@ def image_extent(dataset: xr.Dataset) -> tuple[float, float, float, float]:
 
 
 def pixel_pitch(dataset: xr.Dataset) -> tuple[float, float]:
-    """Return the spacing of rows and of columns [mrad]; the pixels in a single row or column count as square."""
+    """Return row and column spacing [mrad]; the pixels in a single row or column count as square."""
     spans = (dataset["angle_x"].isel(column=0).values, dataset["angle_y"].isel(row=0).values)
     along, across = (float(np.ptp(values)) / max(values.size - 1, 1) for values in spans)
     return along or across or 1.0, across or along or 1.0

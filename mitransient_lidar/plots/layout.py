@@ -61,16 +61,16 @@ class _Plane:
 
 
 def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw pixels, beam and targets of a result on horizontal planes, seen from above, away from the lidar upwards.
+    """Draw a result's pixels, beam and targets on horizontal planes, seen from above, away from the lidar upwards.
 
-    The left of the line of sight is on the left, as in a picture taken from the lidar. Where the lidar does not look
-    along +x, the vertical axis label gives the direction of +x.
+    What is left of the line of sight is on the left, as in a picture taken from the lidar. Where the lidar does not
+    look along +x, the vertical axis label gives the direction of +x.
 
-    The planes are the mean sea level, the targets' mean heights (for at most three; others are drawn on the nearest of
-    them), and the bottom height on the receiver's axis. A level sea refracts lines of sight and the beam. Targets are
-    drawn on the sea level where the receiver sees them, on their planes at their true positions, and on the bottom as
-    shadows in the laser light. Each plane's title gives the point on the receiver's axis. An imager's cells show the
-    received energy.
+    The planes are the mean sea level, the targets' mean heights, and the bottom height on the receiver's axis. At most
+    three targets have planes; others are drawn on the nearest one. A level sea refracts lines of sight and the beam.
+    Targets are drawn on the sea level where the receiver sees them, and on their planes at their true positions. Their
+    shadows in the laser light are drawn on the bottom. Each plane's title gives the point on the receiver's axis. An
+    imager's cells show the received energy.
 
     Results without refractive index, targets or bottom in their attributes have fewer planes.
 
@@ -157,7 +157,7 @@ def _middle(target: dict[str, Any]) -> float:
 
 
 def _sea(attributes: dict[str, Any]) -> LevelSea | None:
-    """Return the water of a result, or None if its refractive index is unknown."""
+    """Return a result's water, or None if its refractive index is unknown."""
     index = optional_number(attributes, "refractive_index")
     layers = np.atleast_1d(attributes.get("index_layers", () if index is None else index))
     boundaries = np.atleast_1d(attributes.get("index_boundaries", ()))

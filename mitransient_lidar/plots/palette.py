@@ -1,8 +1,7 @@
-"""Colours, line styles and markers of all figures and pages.
+"""Colours, line styles and markers for all figures and pages.
 
-Readers with any kind of colour blindness tell the colours of `CATEGORIES` apart: the closest two differ by 18 units of
-CIEDE2000, in normal vision and in simulated protanopia, deuteranopia and tritanopia. Curves also differ in line style
-or marker.
+Readers with any colour blindness tell the colours in `CATEGORIES` apart. The closest two differ by 18 CIEDE2000 units,
+in normal vision and in simulated protanopia, deuteranopia and tritanopia. Curves also differ in line style or marker.
 """
 
 from __future__ import annotations
@@ -65,10 +64,10 @@ def pixel_colours(count: int) -> list[str]:
 
 
 def curves(count: int, colours: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Return colour and line style of each curve, by default with the colours of pixels."""
+    """Return each curve's colour and line style, by default with the pixels' colours."""
     return [{"color": c, "linestyle": _LINES[i % len(_LINES)]} for i, c in enumerate(colours or pixel_colours(count))]
 
 
 def marked(count: int, colours: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Return colour and marker of each series of points, or of curves whose line style has another meaning."""
+    """Return colour and marker for each point series, or for curves whose line style has another meaning."""
     return [{"color": c, "marker": _MARKERS[i % len(_MARKERS)]} for i, c in enumerate(colours or pixel_colours(count))]

@@ -38,7 +38,7 @@ _DECADES = 3.0
 def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
     """Draw a flight into the files flight.png and profile.png in a folder.
 
-    The first one has the pulse locations, all points in a side view by class, and maps of the bottom heights and their
+    The first one has the pulse locations, all points in a side view by class, and maps with bottom heights and their
     errors. The second one has the waveforms and points in a strip, through a target if points lie on one. The side view
     is along x or y, over which points extend farther, the strip along x or y and through most points.
 
@@ -93,7 +93,7 @@ def _draw_track(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
 
 
 def _set_map(ax: Axes, title: str) -> None:
-    """Set the axes of a map, which may be narrow."""
+    """Set a map's axes, which may be narrow."""
     ax.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=title)
     ax.locator_params("x", nbins=3)
 

@@ -1,4 +1,4 @@
-"""Interactive views of results, scenes and points: pages for a browser, and below the cell of a notebook."""
+"""Interactive views for results, scenes and points: pages for a browser, and below a notebook cell."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class View:
     def save(self, path: str | os.PathLike[str] | None = None) -> Path:
         """Write the page to a file, by default a new one in the folder for temporary files, and return its path.
 
-        Such files of the same user are removed an hour later by the next call, when their browser has long read them.
+        The same user's files are removed an hour later by the next call, when their browser has long read them.
 
         Raises
         ------
@@ -84,7 +84,7 @@ def view(result: Given, waveforms: Given | None = None, *, height: int = 640, li
     Parameters
     ----------
     result : xarray.Dataset
-        A result, a record of a receiver or camera, or a gate stack: see `plots.gate_viewer.page.page_text`.
+        A result, a receiver's or camera's record, or a gate stack: see `plots.gate_viewer.page.page_text`.
     waveforms : xarray.Dataset, optional
         A render with a gate stack's pixels.
     height : int
@@ -109,13 +109,13 @@ def view_scene(
 ) -> View:
     """Return a page that shows a scene in three dimensions to scale, which a notebook shows below the cell.
 
-    It shows the sea and the bottom as rays of the renderer meet them, targets, boundaries between layers of the water,
-    the beam, and the field of view of each pixel, all with their names and numbers.
+    It shows the sea and the bottom as the renderer's rays meet them, targets, boundaries between water layers, the
+    beam, and each pixel's field of view. All have their names and numbers.
 
     Parameters
     ----------
     scene, params, instrument
-        As of `loading.scenes.open_scene`.
+        As in `loading.scenes.open_scene`.
     height : int
         Height in a notebook [CSS pixels].
 
@@ -134,15 +134,15 @@ def view_scene(
 
 
 def view_points(source: str | os.PathLike[str], *, height: int = 640) -> View:
-    """Return a page that shows the points of a flight in three dimensions, which a notebook shows below the cell.
+    """Return a page that shows a flight's points in three dimensions, which a notebook shows below the cell.
 
-    Points have the colour of their class, and their heights with errors: against the truth in the store of a flight,
-    and as stated by the file.
+    Points have their class's colour, and their heights with errors: against the truth in a flight's store, and as
+    stated by the file.
 
     Parameters
     ----------
     source : path
-        Folder or store (``flight.zarr``) of a flight, or a LAS or LAZ file of any program.
+        A flight's folder or store (``flight.zarr``), or a LAS or LAZ file from any program.
     height : int
         Height in a notebook [CSS pixels].
 

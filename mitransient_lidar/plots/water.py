@@ -1,4 +1,4 @@
-"""Figures of waters: phase functions, and profiles with the layers that approximate them."""
+"""Water figures: phase functions, and profiles with the layers that approximate them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def plot_water(
     tolerance: float,
     path: drawing.FilePath | None = None,
 ) -> Figure:
-    """Draw the phase function of a water, or a profile with its layers.
+    """Draw a water's phase function, or a profile with its layers.
 
     Arguments and errors as for `studies.water_report.describe_water`.
     """
@@ -87,8 +87,8 @@ def plot_phase_function(
 def plot_profile(profile: Profile, layers: WaterColumn, title: str, path: drawing.FilePath | None = None) -> Figure:
     """Draw a profile with its layers, from `Profile.layers`, and the phase functions of these layers.
 
-    The left panel has the coefficients against depth, lines for the profile and steps for the layers; the right panel
-    has the Fournier-Forand functions of at most 8 layers that differ in bb/b.
+    The left panel has the coefficients against depth, lines for the profile and steps for the layers. The right panel
+    has the Fournier-Forand functions for at most 8 layers that differ in bb/b.
 
     Raises UserError if no Fournier-Forand function has the bb/b of a layer.
     """

@@ -1,4 +1,4 @@
-"""Figures for a result: waveforms of a few pixels with their derivatives, or an imager's image and summed waveform."""
+"""Figures for a result: a few pixels' waveforms with their derivatives, or an imager's image and summed waveform."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
     """Draw a result's waveforms or recorded signals; for an imager each pixel's total and the summed waveform.
 
     Bands are +-1 standard error; for a shot series, the curve is the mean over the shots, and the band contains 90 % of
-    them. Depth is (t - t_surface) c0 / (2 n_g) cos(theta_water), along the line of sight for a single pixel, and on the
+    them. Depth is (t - t_surface) c0 / (2 n_g) cos(theta_water), along the line of sight for one pixel, and on the
     receiver's axis for several. Pixels are drawn in the shapes of their outlines, or as dots without them. The depth
     axis is left out if the result lacks its attributes.
 
@@ -263,9 +263,9 @@ _SMALLEST = 1e-3
 def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw how much the waveform over all pixels changes where a parameter grows, with its standard error.
 
-    A panel for each parameter, below the waveform: the change in percent for 1 % more of the parameter, where the power
-    is at least a thousandth of the largest. Pixels share photons, so that the error of their sum is unknown; the band
-    over several pixels is an upper bound, the sum of their errors.
+    A panel for each parameter, below the waveform, shows the change in percent for a 1 % larger parameter. It leaves
+    out bins with less than a thousandth of the largest power. Pixels share photons, so that the error of their sum is
+    unknown; the band over several pixels is an upper bound, the sum of their errors.
 
     Raises UserError if the result has no derivatives.
 

@@ -1,4 +1,4 @@
-"""Accumulation over the passes of a render: histograms and waveforms, or only gates if memory is short."""
+"""Accumulation over a render's passes: histograms and waveforms, or only gates if memory is short."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ _LIT = 0.05
 
 
 class Light:
-    """Light of passes: the whole, its parts by origin, and perturbed by parameters.
+    """Passes' light: the whole, its parts by origin, and perturbed by parameters.
 
-    Energies have the shape (pixels, origins, bins), or of several shots (shots, pixels, origins, bins).
+    Energies have the shape (pixels, origins, bins), or for several shots (shots, pixels, origins, bins).
     """
 
     def __init__(self, scene: LidarScene, separate: bool) -> None:
@@ -62,7 +62,7 @@ class Light:
         self.whole, self.parts, self.perturbed = LightStatistics(), LightStatistics(), LightStatistics()
 
     def add(self, energy: FloatArray, perturbed: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Add the energies [J] of one pass, and of perturbations with one axis more; return the whole and its power."""
+        """Add one pass's energies [J], and perturbed ones with one axis more; return the whole and its power."""
         whole = energy.sum(axis=-2)
         if self._separate:
             power_of_parts = self._power_of(energy)
@@ -92,7 +92,7 @@ class Light:
 
 
 class PassAccumulator:
-    """Means and standard errors over a render's passes: of all light, or of gates alone.
+    """Means and standard errors over a render's passes: all light, or gates alone.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class PassAccumulator:
     train
         Gates at their times, or None.
     origins
-        Names of the separated light origins.
+        Names for the separated light origins.
     parameters, differences
         Parameters by which light is differentiated, and the subset with central differences.
     batches
@@ -112,7 +112,7 @@ class PassAccumulator:
     smooth
         Standard deviation by which each gate's image is smoothed [pixels], or None.
     size
-        Memory of film, means and errors [bytes], 0 if it is unknown.
+        Memory for film, means and errors [bytes], 0 if it is unknown.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class PassAccumulator:
 
     @property
     def _received(self) -> PassStatistics:
-        """Statistics of all energy that is kept; that in gates is added up where they overlap."""
+        """Statistics for all kept energy; energy in overlapping gates is added up."""
         return self._light.whole.energy if self._kept == "histograms" else self.gates
 
     @property
@@ -207,14 +207,14 @@ class PassAccumulator:
         return np.asarray(smoothed.reshape(energy.shape))
 
     def _smoothing_bias(self) -> FloatArray:
-        """Return the bias of each gate by smoothing, rms over its lit pixels, shape (gates,); NaN if unknown."""
+        """Return each gate's bias by smoothing, rms over its lit pixels, shape (gates,); NaN if unknown."""
         energy, stderr = self.gates.mean, self.gates.stderr
         change = self._smoothed(energy) - energy
         lit = energy > _LIT * np.nanpercentile(energy, 99, axis=0)
         return smoothing_bias(change, stderr, energy, lit)
 
     def require_light(self, passes: int) -> None:
-        """Raise UserError if the record of all passes is empty; values that are not finite count as light."""
+        """Raise UserError if all passes' record is empty; values that are not finite count as light."""
         if not np.any(self._received.mean):
             axis = self.scene.axis
             raise UserError(
@@ -223,10 +223,10 @@ class PassAccumulator:
             )
 
     def errors(self) -> FloatArray:
-        """Return the relative standard errors whose quantile is compared with the target, of bins or gates.
+        """Return the bins' or gates' relative standard errors whose quantile is compared with the target.
 
-        A gate's error is the median over its lit pixels, for gates with their middle between a pixel's surface echo and
-        the end of its bottom echo.
+        A gate's error is the median over its lit pixels. Gates count whose middle is between a pixel's surface echo and
+        its bottom echo's end.
         """
         if self.train is None:
             return self.window.relative_errors(self._light.whole.power.mean, self._light.whole.power.stderr)
@@ -303,7 +303,7 @@ class PassAccumulator:
 
 
 def described(parameters: Sequence[Parameter]) -> list[list[Any]]:
-    """Return names, values, units and methods of parameters, as `results.add_derivatives` takes them."""
+    """Return parameters' names, values, units and methods, as `results.add_derivatives` takes them."""
     return [[getattr(one, name) for one in parameters] for name in ("name", "value", "units", "method")]
 
 
@@ -321,7 +321,7 @@ def choose_accumulator(
     """Return the accumulator for the most quantities whose film, means and errors fit in `max_memory` [GB].
 
     Gate depths are relative to the surface echo's mean time [ns], None without one. Light is separated by `origins`,
-    and differentiated by `parameters`, some by `differences`, if there are any. The power of `batches` of passes is
+    and differentiated by `parameters`, some by `differences`, if there are any. The power in `batches` pass batches is
     kept, too. With a standard deviation [pixels], gate images are smoothed and nothing else is kept.
 
     Raises UserError if images without rows, columns or gates would be smoothed, a histogram without gates or a single
@@ -372,7 +372,7 @@ def choose_accumulator(
 
 
 def share_of_pass(smooth: float) -> float:
-    """Return the path share in a pass with smoothed images: about one divided by the number of averaged pixels."""
+    """Return a pass's path share with smoothed images: about one divided by the number of averaged pixels."""
     return float(np.clip(2.0 ** -np.round(np.log2(4 * np.pi * smooth**2)), _LEAST_SHARE_OF_SMOOTH, 1))
 
 

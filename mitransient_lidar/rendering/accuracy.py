@@ -33,7 +33,7 @@ _SHARED = 1e-9
 
 
 class PassStatistics:
-    """Mean and standard error of one array for each pass (Welford 1962, doi:10.1080/00401706.1962.10490022)."""
+    """Mean and standard error over one array for each pass (Welford 1962, doi:10.1080/00401706.1962.10490022)."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -66,7 +66,7 @@ class PassStatistics:
         return self.stderr_of(slice(None))
 
     def stderr_of(self, part: slice) -> FloatArray:
-        """Return the standard error of the mean for part of the first axis; NaN before the second pass."""
+        """Return the mean's standard error for part of the first axis; NaN before the second pass."""
         if self.count < 2:
             return np.full_like(self._squares[part], np.nan)
         found = self._squares[part] / (self.count - 1)
@@ -74,7 +74,7 @@ class PassStatistics:
 
 
 def smoothing_bias(change: FloatArray, stderr: FloatArray, light: FloatArray, lit: BoolArray) -> FloatArray:
-    """Return the bias of smoothed images over their light, rms over lit pixels, NaN without any.
+    """Return smoothed images' bias over their light, rms over lit pixels, NaN without any.
 
     A second smoothing changes a smooth image as the first one has changed the true image, to first order. Its noise is
     subtracted as if pixels were independent. Structure much finer than the smoothing is not seen.
@@ -82,7 +82,7 @@ def smoothing_bias(change: FloatArray, stderr: FloatArray, light: FloatArray, li
     Parameters
     ----------
     change, stderr
-        Change of the smoothed part by a second smoothing, and standard error of the part, shape (pixels, ...).
+        Change by a second smoothing of the smoothed part, and the part's standard error, shape (pixels, ...).
     light, lit
         All light, and which pixels count, in the same shape.
     """
@@ -92,7 +92,7 @@ def smoothing_bias(change: FloatArray, stderr: FloatArray, light: FloatArray, li
 
 
 class LightStatistics:
-    """Means and standard errors of light energy [J per bin] and power [W]; bins are the last axis."""
+    """Means and standard errors for light energy [J per bin] and power [W]; bins are the last axis."""
 
     def __init__(self) -> None:
         self.energy, self.power = PassStatistics(), PassStatistics()
@@ -158,7 +158,7 @@ class RatioStatistics:
         return int(np.count_nonzero((self._sums[1] > 0) & ~np.isfinite(self.ratio)))
 
     def relative_errors(self) -> FloatArray:
-        """Return the relative standard errors of the pixels, without dark ones."""
+        """Return the pixels' relative standard errors, without dark ones."""
         ratio, stderr = self.ratio, self.stderr
         known = np.isfinite(ratio) & (ratio > 0)
         if not known.any():
@@ -217,7 +217,7 @@ class ErrorCorrelation:
 
 @dataclass(frozen=True)
 class ErrorWindow:
-    """Bins whose errors end a render, from the surface echo to the end of the bottom echo, and land bins."""
+    """Bins whose errors end a render, from the surface echo to the bottom echo's end, and land bins."""
 
     #: Limits for each pixel [ns], shape (pixels,), or for each shot (shots x pixels,); land limits where a pixel sees
     #: no water.
@@ -228,7 +228,7 @@ class ErrorWindow:
 
     @classmethod
     def of_probe(cls, probe: Probe) -> ErrorWindow:
-        """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width.
+        """Return the bins from each pixel's surface echo to its bottom echo's end, with half the pulse width.
 
         Where the record has no bottom, the window ends with the light from the water, or else with the record. This
         light ends when absorption alone has reduced it to `COLUMN_LEVEL` after the surface echo, in the near infrared
@@ -261,7 +261,7 @@ class ErrorWindow:
         return ErrorWindow(start, end, self.time_ns, np.where(alone[:, None], np.nan, land))
 
     def relative_errors(self, waveform: FloatArray, stderr: FloatArray) -> FloatArray:
-        """Return the relative standard errors of a waveform, infinite where it is 0.
+        """Return a waveform's relative standard errors, infinite where it is 0.
 
         Waveform and standard error have the shape (pixels, time), or for several shots (shots, pixels, time). Pixels
         with less than a thousandth of the brightest pixel's energy are excluded.

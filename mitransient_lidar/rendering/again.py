@@ -42,14 +42,14 @@ _ENDS = ("target_error", "max_time", "passes")
 
 
 def is_result(scene: Any) -> bool:
-    """Return whether a scene is given as a result: a dataset, or the path of a file that ends in .nc or .exr."""
+    """Return whether a scene is given as a result: a dataset, or a file path that ends in .nc or .exr."""
     if isinstance(scene, (str, os.PathLike)):
         return Path(scene).suffix.lower() in (".nc", ".exr")
     return isinstance(scene, xr.Dataset)
 
 
 def read_attributes(result: xr.Dataset | str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the attributes of a result, or of its EXR or NetCDF file; raise UserError if it cannot be read."""
+    """Return the attributes in a result, or in its EXR or NetCDF file; raise UserError if it cannot be read."""
     return dict((result if isinstance(result, xr.Dataset) else results.open(result)).attrs)
 
 
@@ -70,8 +70,8 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
     Raises UserError if the result does not contain its scene or an option, or contains only some shots of a series.
 
     `result`: dataset from `render.render`, `passive.render_passive` or `shots.series.render_shots`, or its file.
-    `options`: options of that function which replace the result's, unless they are None; its parameters are added to
-    the scene's.
+    `options`: that function's options that replace the result's, unless they are None; its parameters are added to the
+    scene's.
     """
     attributes = read_attributes(result)
     kind = result_kind(attributes)
@@ -124,7 +124,7 @@ def _frame_options(attributes: Mapping[str, Any], given: Mapping[str, Any]) -> d
 
 
 def _series_options(result: Any, attributes: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options for series of shots alone, for a complete series or for the shots before Ctrl-C."""
+    """Return the options for shot series alone, for a complete series or for the shots before Ctrl-C."""
     series = result if isinstance(result, xr.Dataset) else results.open(result)
     if "shot" not in series.dims or not np.array_equal(series["shot"], np.arange(attributes.get("shots", 0))):
         raise UserError("the dataset holds some shots of a series, which is rendered again as a whole: give all shots")
@@ -161,7 +161,7 @@ def describe_result(path: str | os.PathLike[str]) -> dict[str, str]:
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values of nested objects by their names, joined with points."""
+    """Return nested objects' values by their names, joined with points."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
         flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
@@ -178,7 +178,7 @@ def _text(value: Any) -> str:
 
 
 def _integrator(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the integrator of a result as a dict for Mitsuba."""
+    """Return a result's integrator as a dict for Mitsuba."""
     values = json_attribute(attributes, "plugin_parameters").get("integrator", {})
     return {name: value for name, value in values.items() if value is not None and name != "used"}
 

@@ -88,12 +88,12 @@ def path_parameters(
 
 
 def perturbations(parameters: Sequence[Parameter]) -> list[Perturbation]:
-    """Return the perturbations of the parameters that have one."""
+    """Return the perturbations for the parameters that have one."""
     return [one.perturbation for one in parameters if one.perturbation is not None]
 
 
 def known_names(scene: LidarScene) -> list[str]:
-    """Return the names of a scene's parameters for which paths sum derivatives."""
+    """Return the names among a scene's parameters for which paths sum derivatives."""
     names: list[str] = []
     if scene.water is not None:
         layers = scene.water.layers
@@ -149,7 +149,7 @@ def _parameters(renderer: PassRenderer, name: str, others: Mapping[str, str]) ->
 
 
 def _rippled(scene: LidarScene) -> list[SeaShape]:
-    """Return the sea surfaces of a scene whose ripples have a variance."""
+    """Return a scene's sea surfaces whose ripples have a variance."""
     return [sea for sea in scene.seas if sea.has_ripples and sum(sea.sea.ripple_variance) > 0]
 
 
@@ -174,7 +174,7 @@ def _reflectance(name: str, solid: mi.Shape) -> Parameter:
 
 
 def _uniform_reflectance(solid: mi.Shape) -> float | None:
-    """Return the reflectance of a diffuse solid, None for others."""
+    """Return a diffuse solid's reflectance, None for others."""
     if solid.class_name() == "Instance":
         return None
     kept = mi.traverse(solid.bsdf())
@@ -214,7 +214,7 @@ class _Side:
         self._weights = train.bin_weights(scene.transmitter.pulse, scene.receiver.optics.response_time_ns, scene.axis)
 
     def render(self, seed: int, share: float) -> list[FloatArray]:
-        """Return energy [J] and power [W] of one pass, shape (pixel, time), and that in gates [J], (pixel, gate)."""
+        """Return one pass's energy [J] and power [W], shape (pixel, time), and energy in gates [J], (pixel, gate)."""
         fitted = self._renderer if share == 1 else self._renderer.scaled(share)
         energy = fitted.render_pass(seed).histogram.energy().reshape(fitted.scene.receiver.pixels.count, -1)
         found = [energy, self._power_of(energy)]
@@ -222,11 +222,11 @@ class _Side:
 
 
 class Differences:
-    """Derivatives of impulse response and waveform by scene parameters, from passes that are added one by one.
+    """Derivatives by scene parameters for impulse response and waveform, from passes that are added one by one.
 
     Each pass renders the scene with a parameter above and below its value. Both renders share the random numbers, and
-    the time bins and waves of the unchanged scene: most of the noise cancels in the difference. Cells are wider than in
-    renders of waveforms, and follow beam and sea. The session and its scene stay unchanged.
+    the unchanged scene's time bins and waves. Most noise cancels in the difference. Cells are wider than in renders of
+    waveforms, and follow beam and sea. The session and its scene stay unchanged.
 
     Standard errors are smaller than with independent random numbers (median over lit bins, default steps). In `table1`
     the factors are 117 (``pulse_fwhm_ns``), 13 (``surface_slope_x_deg``), 7 (``off_nadir_deg``), 3.6
@@ -239,13 +239,13 @@ class Differences:
     Parameters
     ----------
     session
-        LoadedScene of an XML scene.
+        LoadedScene from an XML scene.
     integrator
         Lidar integrator.
     names
-        Names of numbers among the scene parameters, as for `loading.parameters.value_of`.
+        Numbers' names among the scene parameters, as for `loading.parameters.value_of`.
     steps
-        Distance of the two values from the scene's value, greater than 0, by name; by default `default_step`.
+        Distance from the scene's value to the two values, greater than 0, by name; by default `default_step`.
     renderer
         Renderer of the unchanged scene, by default a new one.
 
@@ -256,10 +256,10 @@ class Differences:
     values, steps
         Values and steps of the parameters, in their units, shape (parameter,).
     light
-        Derivatives of bin energy [J per unit of the parameter] and of received power [W per unit], shape (parameter,
-        pixel, time). Standard errors leave out the bias by the step; NaN before the second pass.
+        Derivatives for bin energy [J per parameter unit] and received power [W per unit], shape (parameter, pixel,
+        time). Standard errors leave out the bias by the step; NaN before the second pass.
     gates
-        Derivatives of the energy in gates [J per unit of the parameter], shape (parameter, pixel, gate).
+        Derivatives for the energy in gates [J per parameter unit], shape (parameter, pixel, gate).
     """
 
     def __init__(
@@ -312,7 +312,7 @@ class Differences:
         return _Side(renderer)
 
     def add_pass(self, seed: int, share: float = 1.0) -> None:
-        """Render and add one pass for every parameter, with a share of the paths of a full one."""
+        """Render and add one pass for every parameter, with a share of a full one's paths."""
         slopes = []
         for pair, step in zip(self._pairs, self.steps, strict=True):
             sides = zip(*(side.render(seed, share) for side in pair), strict=True)
@@ -326,10 +326,10 @@ class Differences:
 def default_step(name: str, value: float, renderer: PassRenderer) -> float:
     """Return a parameter's step for central differences, from measured noise and bias.
 
-    The derivative's noise falls with the square root of the step or faster, and the bias grows with its square. Depths,
-    the altitude and the angle off nadir shift echoes by a twentieth of the pulse's width at half maximum, which changes
-    derivatives by 0.5 % of the largest one. Other lengths have steps of 5 cm, beams and views 10 % of their width,
-    other angles 0.5 degrees, and all others 1 %. The sea's mean slope has steps of 0.2 degrees. At 3 m/s and 20 degrees
+    The derivative's noise falls with the step's square root or faster, and the bias grows with its square. Depths, the
+    altitude and the angle off nadir shift echoes by a twentieth of the pulse's width at half maximum. This changes
+    derivatives by 0.5 % of the largest one. Steps are 5 cm for other lengths, 10 % of their width for beams and views,
+    0.5 degrees for other angles, 1 % for all others. The sea's mean slope has 0.2 degree steps. At 3 m/s and 20 degrees
     off nadir they change the surface echo from Gaussian slopes by 15 %, and derivatives by 0.4 %.
     """
     known, scene = parameter_of(name), renderer.scene
@@ -351,7 +351,7 @@ def default_step(name: str, value: float, renderer: PassRenderer) -> float:
 
 
 def _checked_value(parameters: Mapping[str, str], name: str) -> float:
-    """Return the value of a measured parameter."""
+    """Return a measured parameter's value."""
     value, known = value_of(parameters, name), parameter_of(name)
     if not is_quantity(known):
         raise UserError(

@@ -1,4 +1,4 @@
-"""Result attributes that describe lidar, sea and the layout of pixels, beam and targets; pixel lines of sight."""
+"""Result attributes that describe lidar, sea, and pixel, beam and target layout; pixel lines of sight."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def with_lines_of_sight(dataset: xr.Dataset, lidar: LidarScene) -> xr.Dataset:
 
 
 def describe_scene(probe: Probe, window: ErrorWindow, focusing: RippleFocusing | None) -> dict[str, Any]:
-    """Return the attributes of a result that describe lidar, sea and expected echoes."""
+    """Return the result attributes that describe lidar, sea and expected echoes."""
     heights = probe.scene.sea_heights
     # Depths are relative to the mean arrival of the surface echo over all pixels.
     arrivals = probe.echoes.surface_ns[:, 1]
@@ -70,7 +70,7 @@ def describe_scene(probe: Probe, window: ErrorWindow, focusing: RippleFocusing |
 
 
 def describe_lidar(probe: Probe) -> dict[str, Any]:
-    """Return the attributes of a result that describe lidar, refractive indices, and layout."""
+    """Return the result attributes that describe lidar, refractive indices, and layout."""
     scene = probe.scene
     transmitter, receiver = scene.transmitter, scene.receiver
     pixels, optics, profile = receiver.pixels, receiver.optics, transmitter.profile
@@ -103,7 +103,7 @@ def describe_lidar(probe: Probe) -> dict[str, Any]:
 
 
 def _describe_pulse(pulse: Pulse) -> dict[str, list[float]]:
-    """Return times [ns] and power [1/ns] of a pulse that is not Gaussian, as lists with at most 1000 samples."""
+    """Return times [ns] and power [1/ns] for a pulse that is not Gaussian, as lists with at most 1000 samples."""
     if pulse.shape == "gaussian":
         return {}
     times = pulse.times_ns
@@ -118,15 +118,15 @@ def describe_layout(probe: Probe) -> dict[str, Any]:
 
     ``receiver_pose`` and ``transmitter_pose`` are origin [m], axis, far and left, 12 numbers each. ``bottom_point`` is
     the point x, y, z [m] where the receiver's axis, refracted by a level sea, meets the bottom (`WaterScene.bottoms`);
-    missing without one. Water of several index layers has ``index_layers``, their refractive indices, and
+    missing without one. Water with several index layers has ``index_layers``, their refractive indices, and
     ``index_boundaries``, the depths between them [m].
 
-    JSON texts are ``beam_outlines`` (share of the peak, and lines), ``pixel_outlines`` (lines of each pixel; not for
-    imagers) and ``target_outlines``, for each target that the view may see (`Rays.meets`). A target has an ``id``,
-    ``z`` (lowest and highest point [m]), ``line`` (its vertical projection), and ``seen`` (its outline on the sea level
-    along the receiver's refracted lines of sight). With a ``bottom_point`` it also has a ``shadow`` (the outline of its
-    shadow in the laser light at this point's height). A line is closed, with the coordinates angle_x, angle_y [mrad] of
-    its points, or x, y [m] for targets. Texts above the limit are omitted.
+    JSON texts are ``beam_outlines`` (peak share, and lines), ``pixel_outlines`` (each pixel's lines; not for imagers)
+    and ``target_outlines``, for each target that the view may see (`Rays.meets`). A target has an ``id``, ``z`` (lowest
+    and highest point [m]) and ``line`` (its vertical projection). ``seen`` is its outline on the sea level along the
+    receiver's refracted lines of sight. With a ``bottom_point`` it also has a ``shadow`` (its shadow's outline in the
+    laser light at this point's height). A line is closed, with its points' coordinates angle_x, angle_y [mrad], or x, y
+    [m] for targets. Texts above the limit are omitted.
     """
     scene = probe.scene
     transmitter, receiver = scene.transmitter, scene.receiver
@@ -159,7 +159,7 @@ def describe_layout(probe: Probe) -> dict[str, Any]:
 
 
 def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | None) -> dict[str, Any]:
-    """Return name, heights and outlines of a target."""
+    """Return a target's name, heights and outlines."""
     sea, points, at = scene.level_sea, surface_points(scene, target), scene.frame_origin[:2]
     seen = sea.crossing(scene.receiver.pose.origin, points)
     found = {
@@ -177,7 +177,7 @@ def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | N
 
 
 def surface_points(scene: WaterScene, solid: mi.Shape) -> FloatArray:
-    """Return the corners of a mesh, or points all over another shape [m], shape (n, 3)."""
+    """Return a mesh's corners, or points all over another shape [m], shape (n, 3)."""
     known = mi.traverse(solid)
     if "vertex_positions" in known:
         return np.array(known["vertex_positions"], dtype=np.float64).reshape(-1, 3)
@@ -210,7 +210,7 @@ def _outline(points: FloatArray) -> list[float]:
 
 
 def _flat(line: FloatArray, size: float | None = None) -> list[float]:
-    """Return a line's rounded coordinates, with errors of about 1/5000 of a size, by default of the largest."""
+    """Return a line's rounded coordinates, with errors about 1/5000 of a size, by default the largest."""
     size = float(np.abs(line).max()) if size is None else size
     digits = max(0, 3 - math.floor(math.log10(max(size, 1e-6))))
     return np.round(line, digits).ravel().tolist()
@@ -231,8 +231,8 @@ def lines_of_sight(scene: LidarScene, turn_deg: float = 0.0) -> LinesOfSight:
     Under water they are straight, and ``surface_time`` is where depths on their scale are 0, before the pulse is
     emitted if the lidar looks down.
 
-    Each pixel uses the better sampled one of two point sets: beam points that are in the pixel, and points in the pixel
-    with the beam's density. A pixel without either has the line of sight at its centre and no share.
+    Each pixel uses the better sampled of two point sets: beam points in the pixel, and points in the pixel with the
+    beam's density. A pixel without either has the line of sight at its centre and no share.
     """
     pixels = scene.receiver.pixels
     depths = _depths_of_scale(scene)
@@ -254,7 +254,7 @@ def lines_of_sight(scene: LidarScene, turn_deg: float = 0.0) -> LinesOfSight:
 
 
 def _turned(scene: LidarScene, turn_deg: float) -> tuple[Pose, Pose]:
-    """Return the poses of receiver and transmitter, turned about the receiver's axis from far to left [deg]."""
+    """Return receiver and transmitter poses, turned about the receiver's axis from far to left [deg]."""
     own, other = scene.receiver.pose, scene.transmitter.pose
     if turn_deg == 0:
         return own, other
@@ -346,7 +346,7 @@ def _choices(count: int) -> mi.Float:
 def _two_way(
     scene: LidarScene, start: Pose, end: Pose, angles: FloatArray, depth: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the times [ns] of paths from one pose at angles [rad], shape (n, 2), by a depth to another, and their end.
+    """Return times [ns] for paths from one pose at angles [rad], shape (n, 2), by a depth to another, and their end.
 
     The ends are angles about the other pose. Paths that do not meet the sea, or end behind the pose, are NaN.
     """

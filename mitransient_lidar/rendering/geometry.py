@@ -1,4 +1,4 @@
-"""Sea, bottoms, targets and layers of a loaded scene within a box of water about the footprints of its lidar."""
+"""A loaded scene's sea, bottoms, targets and layers within a water box about its lidar's footprints."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Relief:
 class Solid:
     """Points of a target [m], (n, 3), its triangles, and its mean reflectance as seen from above.
 
-    A shape may be known by points alone. `share` is that of the triangles that are kept.
+    A shape may be known by points alone. `share` is the kept triangles' share.
     """
 
     name: str
@@ -85,7 +85,7 @@ class SceneGeometry:
 
 @alone
 def scene_geometry(loaded: LoadedScene) -> SceneGeometry:
-    """Return the geometry of a loaded scene, as rays of its renderer meet it.
+    """Return a loaded scene's geometry, as its renderer's rays meet it.
 
     Raises UserError as `scene_parts.find_solids`.
     """
@@ -119,7 +119,7 @@ def scene_geometry(loaded: LoadedScene) -> SceneGeometry:
 
 
 def _looked_at(scene: WaterScene, shape: mi.Shape, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return height [m] and diffuse reflectance of the highest point of a shape at places of the frame.
+    """Return height [m] and diffuse reflectance for a shape's highest point at places in the frame.
 
     They are NaN where the shape is not; so are reflectances of what has no diffuse part, such as metal.
     """
@@ -164,8 +164,8 @@ def _solid(scene: WaterScene, shape: mi.Shape) -> Solid:
 def thinned(faces: IntArray, points: FloatArray, most: int) -> tuple[IntArray, FloatArray]:
     """Return at most so many triangles of a mesh, and the points that they use.
 
-    Of a mesh in many parts, such as leaves, whole parts are left out evenly. The points of others are joined within
-    cubes, of sides that grow until the triangles that are left are few enough.
+    Of a mesh in many parts, such as leaves, whole parts are left out evenly. Others' points are joined within cubes,
+    whose sides grow until few enough triangles are left.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -208,7 +208,7 @@ _SMALLEST_DESCENT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Rays along the outlines of a beam or a pixel, refracted as by a level sea."""
+    """Rays along a beam's or a pixel's outlines, refracted as by a level sea."""
 
     name: str  #: What the outline is of.
     kind: str  #: ``beam``, ``pixel``, or ``lines`` between the pixels of an imager.
@@ -226,9 +226,9 @@ class Bundle:
 
 
 def bundles_of(scene: WaterScene, transmitter: Transmitter | None) -> list[Bundle]:
-    """Return the bundles of all pixels, or of an imager its view and lines between its pixels, and of the beam.
+    """Return the bundles for all pixels, or for an imager its view and lines between its pixels, and for the beam.
 
-    Rays that do not go down from a lidar in the air are left out, and bundles of such rays alone.
+    Rays that do not go down from a lidar in the air are left out, and so are bundles with such rays alone.
     """
     pose, pixels = scene.receiver.pose, scene.receiver.pixels
     outlines = [("pixel", name, pose, lines) for name, lines in _regions(pixels)]
@@ -255,7 +255,7 @@ def bundles_of(scene: WaterScene, transmitter: Transmitter | None) -> list[Bundl
 
 
 def _regions(pixels: PixelArray) -> Iterator[tuple[str, list[FloatArray]]]:
-    """Yield names and outlines (angle_x, angle_y) [rad] of the pixels, or of the field of view of many."""
+    """Yield the pixels' names and outlines (angle_x, angle_y) [rad], or for many pixels the field of view's."""
     if pixels.grid is None and pixels.count <= _MOST_PIXELS:
         yield from zip((f"pixel {name}" for name in pixels.names), pixel_outlines(pixels), strict=True)
         return
@@ -268,12 +268,12 @@ def _regions(pixels: PixelArray) -> Iterator[tuple[str, list[FloatArray]]]:
 
 
 def _step(count: int) -> int:
-    """Return the number of rows or columns of pixels between two lines."""
+    """Return the number of pixel rows or columns between two lines."""
     return -(-count // (_MOST_LINES - 1))
 
 
 def _lines(grid: tuple[int, int], sides: tuple[float, float], radius: float) -> list[FloatArray]:
-    """Return evenly chosen lines between the rows and the columns of an imager within a radius [rad]."""
+    """Return evenly chosen lines between an imager's rows and columns within a radius [rad]."""
     edges = [
         side * (np.unique([*range(0, count, _step(count)), count]) / count - 0.5)
         for count, side in zip(grid, sides, strict=True)
@@ -291,8 +291,8 @@ def _lines(grid: tuple[int, int], sides: tuple[float, float], radius: float) -> 
 def traced(scene: WaterScene, pose: KernelPose, angles: FloatArray) -> FloatArray:
     """Follow rays from a pose at tangent-plane angles [rad], shape (n, 2): points as of `Bundle.loops`.
 
-    They meet the sea at its waves, which do not turn them: they are refracted as by a level sea. Points are NaN of rays
-    that do not go down from a pose in the air.
+    They meet the sea at its waves, which do not turn them: they are refracted as by a level sea. Points are NaN for
+    rays that do not go down from a pose in the air.
     """
     rays = pose.directions(angles)
     if pose.submerged:

@@ -32,9 +32,9 @@ def fit_to_time(
 ) -> tuple[PassRenderer, float, ReceivedLight | None]:
     """Return a renderer whose passes fit into a time limit, with fewer paths where full passes do not.
 
-    Kernels cannot be interrupted. Where the expected number of rays is large for the time, a trial with 1/512 of the
-    paths measures the kernel time. If two full passes would exceed the limit, the number of paths is halved until four
-    passes fit, or the work besides the kernels takes longer.
+    Kernels cannot be interrupted. Where many rays are expected for the time, a trial with 1/512 of the paths measures
+    the kernel time. If two full passes would exceed the limit, the path number is halved until four passes fit, or the
+    work besides the kernels takes longer.
 
     `renderer`: renderer for full passes. `max_time`: time limit for the render [s]. `start_ns`: time at which light
     enters the water [ns]. `seed`, `gates`: arguments of `PassRenderer.render_pass` for the first pass.
@@ -81,7 +81,7 @@ def describe_cost(renderer: PassRenderer, size: float, start_ns: float) -> str:
 
 
 def _rays_per_path(scene: LidarScene, start_ns: float) -> float:
-    """Return a path's largest expected number of rays: scattering events until the end of the record, and ends."""
+    """Return a path's largest expected number of rays: scattering events until the record's end, and ends."""
     if scene.water is None:
         return 2.0
     plume = scene.water.plume
@@ -91,7 +91,7 @@ def _rays_per_path(scene: LidarScene, start_ns: float) -> float:
 
 
 def timed_pass(renderer: PassRenderer, seed: int, gates: GateWeights | None) -> tuple[ReceivedLight, float, float]:
-    """Render a pass; return it, the time of its kernels, and the other time except for their compilation [s]."""
+    """Render a pass; return it, its kernels' time, and the other time except for their compilation [s]."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         began = time.perf_counter()
@@ -105,7 +105,7 @@ def timed_pass(renderer: PassRenderer, seed: int, gates: GateWeights | None) -> 
 
 
 def _at_once(paths: float) -> float:
-    """Return the number of threads, or on a GPU of paths, that share a kernel with a number of paths."""
+    """Return how many threads, or on a GPU paths, share a kernel with a number of paths."""
     if "cuda" in mi.variant():
         return min(max(paths, 1.0), _PATHS_ON_GPU)
     return min(max(paths / _PATHS_PER_THREAD, 1.0), float(dr.thread_count()))

@@ -147,12 +147,11 @@ DEFAULT_QUANTILE = 0.95
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a render or a study.
+    """Progress in a render or a study.
 
     Contains the numbers of completed and, if known, planned units (``pass``, ``shot``, ``place``, ``render`` or
-    ``run``), and the elapsed and estimated remaining time [s]. Also the median and 95th percentile of the relative
-    standard errors, the requested error, the number of completed units that have `failed`, and the `rate` of units per
-    second.
+    ``run``), and the elapsed and estimated remaining time [s]. Also the relative standard errors' median and 95th
+    percentile, the requested error, the number of completed units that have `failed`, and the `rate` [units/s].
 
     With a requested error it also contains the quantile of the relative standard errors that must reach it, and this
     quantile's value. The errors belong to ``bins``, ``gates`` or ``pixels``. Estimates of the passes and the time [s]
@@ -197,7 +196,7 @@ ProgressCallback = Callable[[Progress], None]
 
 @dataclass(frozen=True)
 class Goal:
-    """Render end: a number of passes, an accuracy, or a time [s], whichever comes first.
+    """Render end: number of passes, accuracy or time [s], whichever comes first.
 
     The accuracy is reached when `target_quantile` of the relative standard errors are at most `target_error`.
     """
@@ -216,7 +215,7 @@ class Goal:
         default: Goal,
         target_quantile: float | None = None,
     ) -> Goal:
-        """Check a render's options; without any of them, return the default."""
+        """Check a render's options; without any, return the default."""
         options = RenderOptions(target_error, target_quantile, max_time, passes)
         ends = options.target_error, options.max_time, options.passes
         goal = default if ends == (None, None, None) else cls(*ends)
@@ -233,17 +232,17 @@ class Goal:
         )
 
     def is_accurate(self, error: float | None) -> bool:
-        """Return whether the quantile of the errors is at most the requested error."""
+        """Return whether the errors' quantile is at most the requested error."""
         return self.target_error is not None and error is not None and error <= self.target_error
 
     def needed_passes(self, done: int, error: float | None) -> int | None:
-        """Estimate the passes still needed for the requested error, which falls with the square root of the passes."""
+        """Estimate the passes still needed for the requested error, which falls with their square root."""
         if self.target_error is None or error is None or not np.isfinite(error):
             return None
         return max(round(max(done * (error / self.target_error) ** 2, SMALLEST_PASS_COUNT)) - done, 0)
 
     def remaining(self, done: int, elapsed: float, pace: float, error: float | None) -> float | None:
-        """Estimate the remaining time [s] from the time of a pass [s]."""
+        """Estimate the remaining time [s] from a pass's time [s]."""
         estimates = []
         if self.passes is not None:
             estimates.append(pace * (self.passes - done))
@@ -259,8 +258,8 @@ class PassLog:
     """Outcome of a loop over passes, which Ctrl-C may have interrupted.
 
     `edge_loss` is the energy lost at the edge of the surface mesh [J]; `error_median`, `error_p95` and `error` are the
-    median, the 95th percentile and the goal's quantile of the relative standard errors, NaN without any; `needed_s` is
-    the time still needed for the requested error [s], 0 if it was reached and NaN if it is unknown.
+    relative standard errors' median, 95th percentile and goal quantile, NaN without any; `needed_s` is the time still
+    needed for the requested error [s], 0 if it was reached and NaN if it is unknown.
     """
 
     count: int
@@ -274,7 +273,7 @@ class PassLog:
     error: float
 
     def edge_loss_share(self, received: float) -> float:
-        """Return the share of the energy lost at the surface mesh's edge; `received` by all passes [J]."""
+        """Return the energy share lost at the surface mesh's edge; `received` by all passes [J]."""
         return self.edge_loss / (self.edge_loss + received) if self.edge_loss > 0 else 0.0
 
     def attributes(self, seed: int) -> dict[str, Any]:
@@ -312,13 +311,13 @@ def run_passes(
     Parameters
     ----------
     render_pass
-        Called with the number and the seed of each pass; returns the energy lost at the surface mesh's edge [J].
+        Called with each pass's number and seed; returns the energy lost at the surface mesh's edge [J].
     goal
         Render end.
     seed
         Render seed, a 64-bit integer with a sign.
     errors
-        Returns the relative standard errors, an array of any size; called from the second pass on.
+        Returns the relative standard errors, an array with any size; called from the second pass on.
     errors_of
         Unit to which the errors belong: ``bins``, ``gates`` or ``pixels``.
     verify
@@ -420,9 +419,9 @@ def _shortfall(log: PassLog, errors_of: str, needed: int | None) -> str:
 
 
 def _pace(ends: list[float]) -> float:
-    """Return the time per pass [s] from the start and the ends of passes.
+    """Return the time per pass [s] from the passes' start and ends.
 
-    The first pass includes the compilation of the kernels and is left out where there are others.
+    The first pass includes kernel compilation and is left out where there are others.
     """
     first = 1 if len(ends) > 2 else 0
     return (ends[-1] - ends[first]) / (len(ends) - 1 - first)

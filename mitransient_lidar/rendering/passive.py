@@ -1,4 +1,4 @@
-"""Rendering of daylight images, still or animated."""
+"""Renders daylight images, still or animated."""
 
 from __future__ import annotations
 
@@ -98,8 +98,8 @@ def render_passive(
     integrator
         Name or dict of a passive integrator; by default the scene's, or ``passive_volpath``.
     target_error, target_quantile, max_time, passes
-        End of a frame, as for `render.render` with pixels instead of bins; by default 0.05 within 120 s. `passes` may
-        be a list with one number per frame.
+        A frame's end, as for `render.render` with pixels instead of bins; by default 0.05 within 120 s. `passes` may be
+        a list with one number per frame.
     seed
         Integer from -2^63 to 2^63 - 1, 0 by default; frames and passes have independent random numbers.
     frame_step_s
@@ -189,7 +189,7 @@ def _labelled(
     filter_width_nm: float | None,
     attributes: Mapping[str, Any],
 ) -> xr.Dataset:
-    """Return radiances and their errors, shape (pixels,), at times [s] of frames, as a dataset."""
+    """Return radiances and their errors, shape (pixels,), at frame times [s], as a dataset."""
     coords = results.pixel_coordinates(pixels.names, 1e3 * pixels.centres(), pixels.grid)
     inner, shape = coords["angle_x"][0], coords["angle_x"][1].shape
     dims, counts = (inner, shape) if times is None else (("frame", *inner), (len(images), *shape))
@@ -214,9 +214,9 @@ def _labelled(
 def _render_frame(
     renderer: DaylightRenderer, goal: Goal, seed: int, progress: ProgressCallback | None, smooth: float | None
 ) -> tuple[RatioStatistics, PassLog, float, float]:
-    """Render one frame's passes; return statistics, log, share of the light lost at the surface's edge, and bias.
+    """Render one frame's passes; return statistics, log, light share lost at the surface's edge, and bias.
 
-    The bias is that of smoothed images, else NaN.
+    The bias is the smoothed images' bias, else NaN.
     """
     pixels = renderer.scene.receiver.pixels
     statistics, scattered, received = RatioStatistics(pixels.count), PassStatistics(), 0.0
@@ -262,7 +262,7 @@ def _render_frame(
 
 
 def _smoothed(found: FloatArray, sampled: FloatArray, grid: tuple[int, int], smooth: float) -> FloatArray:
-    """Return the smoothed ratio of an image and its samples, shape (pixels,); 0 far from all samples."""
+    """Return the smoothed ratio between an image and its samples, shape (pixels,); 0 far from all samples."""
     from scipy.ndimage import gaussian_filter
 
     light, samples = (gaussian_filter(one.reshape(grid), smooth).ravel() for one in (found, sampled))
@@ -307,7 +307,7 @@ def _etendue(renderer: DaylightRenderer) -> FloatArray:
 
 
 def _describe(renderer: DaylightRenderer) -> dict[str, Any]:
-    """Return the attributes of receiver and daylight; warn about a field of view beyond the surface."""
+    """Return receiver and daylight attributes; warn about a field of view beyond the surface."""
     scene, receiver = renderer.scene, renderer.scene.receiver
     outside = share_outside_surface(scene, renderer.sampler)
     if outside > TOLERATED_LOSS:

@@ -1,4 +1,4 @@
-"""Rendering of a lidar scene to an accuracy, or of a result again."""
+"""Renders a lidar scene to an accuracy, or a result again."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def render(
         record, or a session. A result (a dataset, or its EXR or NetCDF file) is rendered again with its own options
         unless others are given. See `render_again`.
     params
-        Values for the parameters of an XML scene and of its plugins; they have priority over an instrument's.
+        Values for parameters in an XML scene and its plugins; they have priority over an instrument's.
     infrared
         Whether to also render the instrument's infrared channel, at the same place; it takes a render of its own. See
         `loading.catalogue.with_infrared` for the parameters, and `results.attributes`.
@@ -169,9 +169,9 @@ def render(
 
     Notes
     -----
-    Standard errors come from the spread of the passes. Intervals by Student's t with one degree of freedom less than
-    the attribute ``passes`` have their nominal coverage where the error is below a tenth of the value. Where it is 20
-    to 40 %, 95 % intervals from 8 passes contain the mean in 91 to 93 % of the bins, and where it is larger, in fewer.
+    Standard errors come from the passes' spread. Intervals by Student's t have ``passes`` minus 1 degrees of freedom.
+    Their coverage is nominal where the error is below a tenth of the value. Where it is 20 to 40 %, 95 % intervals from
+    8 passes contain the mean in 91 to 93 % of the bins; in fewer where it is larger.
     """
     derivatives = [derivatives] if isinstance(derivatives, str) else derivatives
     options = {name: value for name, value in locals().items() if name in RenderOptions.__dataclass_fields__}
@@ -199,9 +199,9 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     reordered, or an option is invalid.
 
     `result`: dataset from `render`, `passive.render_passive` or `shots.series.render_shots`, or its file. A dataset
-    that was computed from a result, such as gates or receiver signals, gives a render of that result. A series gives
-    all shots, or the shots that were completed before Ctrl-C. `options`: options of the function that rendered the
-    result, by default the values in its attributes. `params` are added to its scene's parameters.
+    computed from a result, such as gates or receiver signals, renders that result again. A series gives all shots, or
+    the shots that were completed before Ctrl-C. `options`: options of the function that rendered the result, by default
+    the values in its attributes. `params` are added to its scene's parameters.
 
     Returns
     -------

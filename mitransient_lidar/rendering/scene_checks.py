@@ -1,4 +1,4 @@
-"""Checks of a scene before it is rendered: whether light can return, from which shapes, and when."""
+"""Checks before a scene is rendered: whether light can return, from which shapes, and when."""
 
 from __future__ import annotations
 
@@ -41,11 +41,12 @@ _PULSES = 5.0
 def check_scene(probe: Probe) -> None:
     """Refuse a probe's scene that can return no light within its record, and warn about parts that cannot contribute.
 
-    Warnings name shapes whose echo comes before or after the record, and shapes out of view, outside the beam, or
-    partly in the air. They also report a laser and a receiver whose axes do not meet.
+    Warnings name shapes whose echo is outside the record, and shapes out of view, outside the beam, or partly in the
+    air. They also report a laser and a receiver whose axes do not meet.
 
-    Raises UserError if no pixel sees the sea or a solid, the beam misses them, beam and view are too far apart for the
-    record, nothing in view reflects or scatters light, the record contains no echo, or a target lies below the bottom.
+    Raises UserError if no pixel sees the sea or a solid, the beam misses them, or beam and view are too far apart for
+    the record. Further, if nothing in view reflects or scatters light, the record contains no echo, or a target lies
+    below the bottom.
     """
     scene, view, beam = probe.scene, probe.view, probe.beam
     if scene.submerged:
@@ -85,7 +86,7 @@ def warn_of_shadows(scene: LidarScene) -> None:
 
 
 def _check_under_water(probe: Probe) -> None:
-    """Check the record of a lidar under water: without the laser itself and total reflection, and with every echo."""
+    """Check an underwater lidar's record: without the laser itself and total reflection, and with every echo."""
     scene, axis = probe.scene, probe.scene.axis
     first_ns = earliest_ns(scene, scene.transmitter)
     if first_ns is not None and axis.start_ns < first_ns:
@@ -111,7 +112,7 @@ def _place(scene: WaterScene, point: FloatArray) -> str:
 
 
 def _check_axis_under_water(probe: Probe) -> None:
-    """Refuse a record that ends before the surface echo, or begins after the echo of a bottom below all pixels."""
+    """Refuse a record that ends before the surface echo, or begins after a bottom's echo below all pixels."""
     axis, surface = probe.scene.axis, probe.echoes.surface_ns[:, 0]
     first = float(np.nanmin(surface)) if np.isfinite(surface).any() else np.nan
     if axis.end_ns <= first:
@@ -219,7 +220,7 @@ def _check_solids(probe: Probe) -> None:
 
 
 def _warn_of_axes(scene: LidarScene, view: Rays, beam: Rays) -> None:
-    """Warn about axes of laser and receiver that do not meet in the water or on the surface."""
+    """Warn about laser and receiver axes that do not meet in the water or on the surface."""
     boxes = [box_of(solid) for solid in scene.solids]
     highest = max([0.0, *(min(high[2], 0.5 * view.pose.origin[2]) for _, high in boxes)])
     # Without a solid, to the depth from which light returns within the record.
@@ -258,7 +259,7 @@ def _out_of_place(solid: mi.Shape, view: Rays, beam: Rays) -> str:
 
 
 def _warn_of_inside_out(solid: mi.Shape) -> None:
-    """Warn of a sphere or a closed mesh that reflects on one side only, the inside."""
+    """Warn about a sphere or a closed mesh that reflects on one side only, the inside."""
     if int(solid.bsdf().flags()) & mi.BSDFFlags.BackSide.value or not _is_inside_out(solid):
         return
     logger.warning(
@@ -269,7 +270,7 @@ def _warn_of_inside_out(solid: mi.Shape) -> None:
 
 
 def _is_inside_out(solid: mi.Shape) -> bool:
-    """Return whether the normals of a sphere or of a closed mesh point inwards."""
+    """Return whether a sphere's or a closed mesh's normals point inwards."""
     if solid.class_name() == "Sphere":
         return bool(solid.has_flipped_normals())
     if not isinstance(solid, mi.Mesh):

@@ -1,8 +1,8 @@
-"""Variables, attributes and coordinates of results: units and long names (CF-1.11), types in files, and ranges.
+"""Results' variables, attributes and coordinates: units and long names (CF-1.11), types in files, and ranges.
 
-The registry of variables is the file ``variables.csv``. `label` describes a dataset's variables by their names.
-Standard errors and limits follow from their variable. A name with several meanings has an entry for each dataset kind,
-``kind.name``. Variables of an instrument's infrared channel have names of their own in its results.
+The file ``variables.csv`` registers variables. `label` describes a dataset's variables by their names. Standard errors
+and limits follow from their variable. A name with several meanings has an entry for each dataset kind, ``kind.name``.
+Variables for an instrument's infrared channel have their own names.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mitransient_lidar.core.validation import shown as printed
 
 
 def _read() -> dict[str, tuple[str, str]]:
-    """Return the unit, empty for texts, and the long name of each variable."""
+    """Return each variable's unit, empty for texts, and long name."""
     table = importlib.resources.files("mitransient_lidar.results") / "variables.csv"
     return {row[0]: (row[1], row[2]) for row in csv.reader(table.read_text("utf-8").splitlines()[1:])}
 
@@ -91,7 +91,7 @@ def label(dataset: xr.Dataset, kind: str = "", **units: str) -> xr.Dataset:
 
 
 def flagged(meanings: type[IntEnum] | type[IntFlag]) -> dict[str, Any]:
-    """Return the attributes for a variable whose values, or bits in a set of flags, are members of an enum."""
+    """Return the attributes for a variable whose values, or bits in flags, are an enum's members."""
     key = "flag_masks" if issubclass(meanings, IntFlag) else "flag_values"
     return {
         key: [int(one) for one in meanings],
@@ -164,7 +164,7 @@ _FIRST = (
 def provenance(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Return a result's attributes, checked, with ``title``, ``source`` and ``history`` added.
 
-    Raises `ValueError` if an attribute is no int, float, str or list of one of those.
+    Raises `ValueError` if an attribute is no int, float, str or list with one such type.
     """
     return {
         "Conventions": "CF-1.11",
@@ -176,7 +176,7 @@ def provenance(attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def made_from(attributes: Mapping[Any, Any], title: str, done: str) -> dict[str, str]:
-    """Return ``title`` and ``history`` of a dataset that is made from one with these attributes."""
+    """Return ``title`` and ``history`` for a dataset that is made from one with these attributes."""
     return {"title": titled(title, attributes), "history": step_of_history(done, attributes)}
 
 
@@ -203,7 +203,7 @@ def shown(attributes: Mapping[str, Any]) -> dict[str, Any]:
 def attribute(name: str, value: Any) -> int | float | str | list[int] | list[float] | list[str]:
     """Convert an attribute to a Python type that both file formats return unchanged.
 
-    Raises `ValueError` if it is no int, float, str or list of one of those.
+    Raises `ValueError` if it is no int, float, str or list with one such type.
     """
     if isinstance(value, (tuple, list, np.ndarray)):
         items = [attribute(name, item) for item in value]
@@ -222,7 +222,7 @@ def attribute(name: str, value: Any) -> int | float | str | list[int] | list[flo
 
 
 def text(value: str | Path) -> str:
-    """Replace text that UTF-8 or NetCDF cannot store: bytes of undecodable file names, and NUL."""
+    """Replace text that UTF-8 or NetCDF cannot store: bytes in undecodable file names, and NUL."""
     return str(value).replace("\0", "\ufffd").encode("utf-8", "replace").decode("utf-8")
 
 
@@ -253,7 +253,7 @@ def check_attributes(place: object, attributes: Mapping[Any, Any]) -> None:
 
 
 def check_coordinates(place: object, dataset: xr.Dataset, name: str) -> None:
-    """Raise `UserError` if a known coordinate or a variable of a result does not hold numbers over its dimensions."""
+    """Raise `UserError` if a result's known coordinate or variable does not contain numbers over its dimensions."""
     dims = set(dataset[name].dims)
     for one in (*_COORDINATES, name, f"{name}_stderr"):
         if one not in dataset.variables:
@@ -323,10 +323,10 @@ _PREFIX, _SHARED = f"{INFRARED}_", "shot"
 
 
 def join(green: xr.Dataset, infrared: xr.Dataset) -> xr.Dataset:
-    """Return one dataset of both channels.
+    """Return one dataset with both channels.
 
-    Variables and dimensions of the infrared channel have the prefix ``infrared_``, but for ``shot``, which is that of
-    both; of two series, the shots that both have remain.
+    The infrared channel's variables and dimensions have the prefix ``infrared_``; both channels share ``shot``. From
+    two series, the shots that both have remain.
     """
     names: dict[Hashable, str] = {name: f"{_PREFIX}{name}" for name in (*infrared.variables, *infrared.dims)}
     names.pop(_SHARED, None)
@@ -339,7 +339,7 @@ def join(green: xr.Dataset, infrared: xr.Dataset) -> xr.Dataset:
 
 
 def split(dataset: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset | None]:
-    """Return the green and the infrared channel of a dataset, the latter None where it has none."""
+    """Return a dataset's green and infrared channel, the latter None where it has none."""
     own = [name for name in dataset.variables if str(name).startswith(_PREFIX)]
     green = dataset.drop_vars(own)
     green.attrs = {name: value for name, value in dataset.attrs.items() if name != INFRARED}

@@ -58,11 +58,11 @@ def build(
     pixel_names : sequence of str
         Unique pixel names; unused with `grid`.
     pixel_centres_mrad : array-like of shape (pixel, 2)
-        Tangent-plane angles (angle_x, angle_y) of the pixel centres [mrad].
+        Pixel centres' tangent-plane angles (angle_x, angle_y) [mrad].
     grid : tuple of int, optional
-        Rows and columns of an imager, with pixels in row-major order.
+        An imager's rows and columns, with pixels in row-major order.
     attributes : mapping of str to int, float, str or a list of those
-        Parameters and outcome of the render; they override the attributes set here (``title``, ``history``, ...).
+        The render's parameters and outcome; they override the attributes set here (``title``, ``history``, ...).
     """
     bins = {"time_start_ns": finite("time_start_ns", time.start_ns)}
     bins["bin_width_ns"] = positive("bin_width_ns", time.bin_width_ns)
@@ -97,7 +97,7 @@ def build_series(*arrays: npt.ArrayLike, **described: Any) -> xr.Dataset:
 def add_components(dataset: xr.Dataset, origins: Sequence[str], *arrays: npt.ArrayLike) -> xr.Dataset:
     """Return a result from `build` or `build_series` with its light by origin.
 
-    Arrays are the four of `build`, shape (pixel, origin, time), in a series with the shots first; names of origins are
+    Arrays are the four in `build`, shape (pixel, origin, time), in a series with the shots first; origins' names are
     unique.
     """
     values = [np.moveaxis(np.asarray(array, dtype=np.float64), -2, 0) for array in arrays]
@@ -116,9 +116,9 @@ def add_derivatives(
     """Return a result from `build` or `build_series` with its derivatives by parameters.
 
     `dataset`: the result. `names`, `values`, `units`, `methods`: for each parameter: unique name, value at which the
-    light was rendered, unit, and ``score`` or ``central differences``. `arrays`: derivatives of the four arrays of
-    `build` by the parameter in its unit; in a series with the shots after the parameters, shape (parameter, pixel,
-    time).
+    light was rendered, unit, and ``score`` or ``central differences``. `arrays`: the four arrays in `build`,
+    differentiated by the parameter in its unit, shape (parameter, pixel, time); in a series with the shots after the
+    parameters.
     """
     coords = {
         "parameter": np.array(names, dtype=str),
@@ -168,7 +168,7 @@ def _add(
 
 
 def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple[str, ...]:
-    """Return the dimensions of a variable, (pixel, time) or (row, column, time), with `shots` also after ``shot``.
+    """Return a variable's dimensions, (pixel, time) or (row, column, time), with `shots` also after ``shot``.
 
     Raises `UserError` if the variable or a coordinate is missing, the dimensions are others or empty, or the times are
     invalid.
@@ -191,7 +191,7 @@ def time_axis(dataset: xr.Dataset) -> TimeAxis:
 
     They come from the attributes ``time_start_ns`` and ``bin_width_ns`` where the coordinate ``time`` agrees with them,
     else from the coordinate, as after a selection of bins. Raises `UserError` if the dataset has no coordinate
-    ``time``, or a single bin of unknown width.
+    ``time``, or a single bin with unknown width.
     """
     if "time" not in dataset.coords:
         raise UserError("the dataset has no coordinate time")
@@ -213,7 +213,7 @@ def pixel_coordinates(
 ) -> dict[str, Any]:
     """Return pixel coordinates: their names, or rows and columns, and their centres angle_x and angle_y.
 
-    Arguments as for `build`. Raises `ValueError` if names repeat, or their number differs from that of the centres.
+    Arguments as for `build`. Raises `ValueError` if names repeat, or their number differs from the centres' number.
     """
     centres = np.asarray(pixel_centres_mrad, dtype=np.float64)
     count = len(centres)
@@ -236,7 +236,7 @@ def pixel_coordinates(
 def check_axes(place: object, dataset: xr.Dataset, name: str) -> None:
     """Raise `UserError` if a variable has no times, pixels or bins, or times that are not finite or not increasing.
 
-    The known attributes and coordinates of the dataset are checked, too.
+    The dataset's known attributes and coordinates are checked, too.
     """
     check_attributes(place, dataset.attrs)
     dims = tuple(str(dim) for dim in dataset[name].dims)

@@ -1,18 +1,18 @@
 """OpenEXR files for datasets: parts with 32-bit floating-point channels, compressed with ZIP, and their metadata.
 
-- Time bins are the layers of one part: the stack ``bin`` with the components ``Y`` and ``stderr`` becomes the channels
-  ``bin0000.Y``, ``bin0000.stderr``, ``bin0001.Y`` and so on, with four digits or as many as the last bin needs. More
-  than 1024 channels fill several parts, named by their first channel.
+- Time bins are the layers in one part. The stack ``bin`` with the components ``Y`` and ``stderr`` becomes the channels
+  ``bin0000.Y``, ``bin0000.stderr``, ``bin0001.Y`` and so on. They have four digits, or as many as the last bin needs.
+  More than 1024 channels fill several parts, named by their first channel.
 - Gates, and daylight frames, are one part each, named ``gate000`` (four digits from 1000 gates on) or ``frame0000``,
-  with the channels ``Y`` and ``Y.stderr``. Camera gates have the moments of their frames (``Y``, their mean,
-  ``Y.deviation``, ...), and each frame's digital numbers (``frame0000.Y``, ``frame0000.saturated``). Every part has the
-  header attributes ``gateStartNs``, ``gateWidthNs`` and, if known, ``gateDepthM``, or ``timeS``. A sequence is a folder
-  with one file per gate, numbered like the parts.
+  with the channels ``Y`` and ``Y.stderr``. Camera gates have their frames' moments (``Y``, their mean, ``Y.deviation``,
+  ...), and each frame's digital numbers (``frame0000.Y``, ``frame0000.saturated``). Every part has the header
+  attributes ``gateStartNs``, ``gateWidthNs`` and, if known, ``gateDepthM``, or ``timeS``. A sequence is a folder with
+  one file per gate, numbered like the parts.
 
 Pixels without a grid form an image one row high. Dimensions, coordinates and attributes are written twice. OpenEXR
 supports only 32-bit integers and floats and no empty list, so a JSON string (header attribute ``mitransientLidar``)
-stores them exactly; ``exrheader`` and other programs read copies of the numbers and texts that most readers need. The
-attribute ``mitransientLidarSha256`` in each part is the checksum of that string and of the channels: OpenEXR has none
+stores them exactly; ``exrheader`` and other programs read copied numbers and texts that most readers need. The
+attribute ``mitransientLidarSha256`` in each part is the checksum over that string and the channels: OpenEXR has none
 for its header, nor for blocks that ZIP cannot make smaller.
 """
 
@@ -92,7 +92,7 @@ class Part(NamedTuple):
 
 
 def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *, sequence: bool = False) -> list[Part]:
-    """Return a dataset with ``waveforms``, ``gates`` or ``radiance`` as parts for a file, or for a sequence of files.
+    """Return a dataset with ``waveforms``, ``gates`` or ``radiance`` as parts for a file or a file sequence.
 
     Raises `UserError` if the dataset has variables that the file cannot store, or so many channels do not fit into the
     memory.
@@ -132,7 +132,7 @@ def parts_of(dataset: xr.Dataset, path: str | os.PathLike[str], content: str, *,
 
 
 def _kind(content: str, variables: Iterable[Any]) -> _Images | None:
-    """Return how the images of a content are stored, None for waveforms."""
+    """Return how a content's images are stored, None for waveforms."""
     if content != "frames":
         return _IMAGES.get(content)
     names = [str(name) for name in variables]
@@ -147,7 +147,7 @@ def _kind(content: str, variables: Iterable[Any]) -> _Images | None:
 
 
 def _split_frames(dataset: xr.Dataset, path: str | os.PathLike[str]) -> xr.Dataset:
-    """Return the frames of a camera with a variable for each frame, all over the pixels and gates."""
+    """Return a camera's frames with a variable for each frame, all over the pixels and gates."""
     if "frame" in dataset["signal_mean"].dims or 2 * dataset.sizes["frame"] > _MOST_CHANNELS - len(_MOMENTS):
         raise UserError(
             f"cannot write {path}: an EXR file holds up to {(_MOST_CHANNELS - len(_MOMENTS)) // 2} frames of one sea; "
@@ -196,7 +196,7 @@ def _layers(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str
 
 
 def _images(dataset: xr.Dataset, exact: Mapping[str, Any], readable: Mapping[str, Any], kind: _Images) -> list[Part]:
-    """Return images as parts, with readable attributes in the first one, or in all of a sequence."""
+    """Return images as parts, with readable attributes in the first one, or in a sequence's every part."""
     single = kind.dim not in dataset.dims
     stack = dataset.expand_dims(kind.dim) if single else dataset
     images = {name: _pictures(stack[name].transpose(kind.dim, ...).values, 0) for name in kind.channels}
@@ -230,9 +230,9 @@ def _pictures(values: npt.NDArray[Any], axis: int) -> npt.NDArray[np.float32]:
 def write_sequence(stack: xr.Dataset, folder: Path, stem: str) -> None:
     """Write a gate stack as numbered files in a folder, one per gate: ``<stem>_gate000.exr`` and so on.
 
-    The folder is created if it is missing, and existing files of the same names are replaced. The first file is written
-    last, so that `read` rejects an interrupted sequence. Raises `UserError` if `stem` is no file name, or a file cannot
-    be written.
+    The folder is created if it is missing, and existing files with the same names are replaced. The first file is
+    written last, so that `read` rejects an interrupted sequence. Raises `UserError` if `stem` is no file name, or a
+    file cannot be written.
     """
     if not stem or Path(stem).name != stem:
         raise UserError(f"stem = {stem!r} must be the start of a file name, without folders")
@@ -269,7 +269,7 @@ def write(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
 
 
 def read(path: Path) -> xr.Dataset:
-    """Read a dataset from a file, the first file of a sequence, or a folder with one sequence.
+    """Read a dataset from a file, a sequence's first file, or a folder with one sequence.
 
     Raises `UserError` if a file is missing, damaged or truncated, or was not written by this package.
     """
@@ -296,7 +296,7 @@ def read(path: Path) -> xr.Dataset:
 
 
 def _of_layers(path: Path, parts: Sequence[Part]) -> dict[str, npt.NDArray[Any]]:
-    """Return the values of variables over time bins, (row, column, time)."""
+    """Return variables' values over time bins, (row, column, time)."""
     layers: dict[tuple[str, str], dict[int, npt.NDArray[np.float32]]] = {}
     for part in parts:
         for name, image in part.channels.items():
@@ -314,7 +314,7 @@ def _of_layers(path: Path, parts: Sequence[Part]) -> dict[str, npt.NDArray[Any]]
 def _of_images(
     path: Path, parts: list[Part], exact: Mapping[str, Any], kind: _Images
 ) -> dict[str, npt.NDArray[np.float32]]:
-    """Return the values of variables with one part per image, (..., row, column) with the dimension of the parts."""
+    """Return variables' values with one part per image, (..., row, column) with the parts' dimension."""
     along = kind.dim in exact["dims"]
     count = len(exact["coordinates"][next(iter(kind.header))]["values"]) if along else 1
     if exact["is_sequence"] and count > 1:
@@ -332,7 +332,7 @@ def _of_images(
 
 
 def _labelled(images: Mapping[str, npt.NDArray[Any]], exact: Mapping[str, Any]) -> xr.Dataset:
-    """Return the dataset of images by variable; those without a grid lose their row."""
+    """Return the dataset for images by variable; images without a grid lose their row."""
     dims = tuple(exact["dims"])
     coordinates = {
         name: (item["dims"], np.array(item["values"], dtype=item["kind"]), item["attributes"])
@@ -346,7 +346,7 @@ def _labelled(images: Mapping[str, npt.NDArray[Any]], exact: Mapping[str, Any]) 
 
 
 def _later_files(first: Path, count: int) -> list[Part]:
-    """Return the images of a sequence after the first file; raise `UserError` if a file is missing or damaged."""
+    """Return a sequence's images after the first file; raise `UserError` if a file is missing or damaged."""
     number = _NUMBERED.fullmatch(first.name)
     if number is None or int(number[2]) != 0:
         raise UserError(f"{first} is the first of {count} files of a sequence: its name must end in _gate000.exr")

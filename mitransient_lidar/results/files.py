@@ -49,7 +49,7 @@ def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a dataset to a NetCDF-4 file; an existing one is overwritten.
 
     It goes by way of memory, because HDF5 ends the process where the disk is full. Signals behind a converter are
-    written as its codes. Raises `ValueError` if an attribute is no number, text or list of one of these. Raises
+    written as its codes. Raises `ValueError` if an attribute is no number, text or list with one such type. Raises
     `OSError` if the file cannot be written.
     """
     import h5netcdf
@@ -69,7 +69,7 @@ def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
 
 
 def _stored(dataset: xr.Dataset) -> tuple[xr.Dataset, dict[str, dict[str, Any]]]:
-    """Return a dataset as it is stored in a file or a group, and the encoding of its variables."""
+    """Return a dataset as it is stored in a file or a group, and its variables' encoding."""
     dataset = dataset.drop_encoding()
     attributes = {str(name): attribute(str(name), value) for name, value in dataset.attrs.items()}
     dataset.attrs = of_other_programs(attributes)
@@ -87,7 +87,7 @@ def _stored(dataset: xr.Dataset) -> tuple[xr.Dataset, dict[str, dict[str, Any]]]
 
 
 def _codes(signal: np.ndarray[Any, Any], attributes: dict[str, Any]) -> dict[str, Any]:
-    """Return the encoding of signals [V] as codes of the converter in the attributes; empty for other values."""
+    """Return the encoding for signals [V] as the converter's codes in the attributes; empty for other values."""
     names = ("receiver.digitiser.bits", "receiver.digitiser.full_scale_v", "receiver.digitiser.low_v")
     if not set(names) <= attributes.keys():
         return {}
@@ -145,7 +145,7 @@ def read_netcdf(path: str | os.PathLike[str]) -> tuple[xr.Dataset, bool]:
 
 
 def _group(path: str | os.PathLike[str], group: str | None, damaged: str) -> tuple[xr.Dataset, bool]:
-    """Return the dataset of a file, or of a group in it, and whether another program has written it."""
+    """Return the dataset in a file, or in a group in it, and whether another program has written it."""
     with damaged_file(damaged), xr.open_dataset(path, group=group, engine="h5netcdf", decode_times=False) as file:
         check_size(path, file.nbytes, largest_result())
         dataset = file.load().drop_encoding()
@@ -183,9 +183,9 @@ Given = Union["xr.Dataset", str, os.PathLike[str]]
 
 
 def open(path: str | os.PathLike[str], **selection: Any) -> xr.Dataset:
-    """Read a dataset into memory from a file of `save`, or from a folder with a sequence of gates.
+    """Read a dataset into memory from a file that `save` wrote, or from a folder with a gate sequence.
 
-    Waveforms over time of other programs are read from NetCDF-4 files, too. The content shows the format, not the name;
+    Other programs' waveforms over time are read from NetCDF-4 files, too. The content shows the format, not the name;
     but .las, .laz, .pls and .wvs files are read by `waveform_files.read_waveforms`, with its `selection`.
 
     Raises
@@ -289,13 +289,13 @@ def is_exr(path: str | os.PathLike[str]) -> bool:
 
 
 def kinds_of(dataset: xr.Dataset) -> set[str]:
-    """Return the kinds of a dataset: ``result``, ``waveforms``, ``signals``, ``frames``, ``gates``, ..."""
+    """Return a dataset's kinds: ``result``, ``waveforms``, ``signals``, ``frames``, ``gates``, ..."""
     found = {kind for kind, (_, variables) in _KINDS.items() if all(name in dataset for name in variables)}
     return found - {"signals" if has_frames(dataset) else "frames"}
 
 
 def dataset_of(name: str, given: Given, *kinds: str, **selection: Any) -> xr.Dataset:
-    """Return a dataset of one of the kinds from `kinds_of`, given itself, or by its path for `open` with `selection`.
+    """Return a dataset with a kind from `kinds_of`, given itself, or by its path for `open` with `selection`.
 
     Raises `UserError`, with the parameter's name, if it is neither, or of none of these kinds, or the file cannot be
     read.
@@ -315,6 +315,6 @@ def dataset_of(name: str, given: Given, *kinds: str, **selection: Any) -> xr.Dat
 
 
 def _listed(kinds: Iterable[str]) -> str:
-    """Return the names of dataset kinds, the last one after "or"."""
+    """Return dataset kinds' names, the last one after "or"."""
     *first, last = (_KINDS[kind][0] for kind in kinds)
     return f"{', '.join(first)} or {last}" if first else last

@@ -1,10 +1,10 @@
-"""Gate stacks: the energy of each pixel in each gate, as a labelled dataset.
+"""Gate stacks: each pixel's energy in each gate, as a labelled dataset.
 
 A gate stack is an `xarray.Dataset` with ``gate_energy`` and ``gate_energy_stderr`` [J], the energy that a pixel
 collects while a gate is open, summed over the gate's pulses. Dimensions are (row, column, gate) for imagers and (pixel,
-gate) otherwise. Coordinates are the pixels' own, ``gate`` (0, 1, ...), ``gate_start`` and ``gate_width`` [ns] between
-half heights, and ``gate_depth`` [m], the depth of the gate's middle on the receiver's axis, NaN where the surface echo
-time is unknown. In the other pixels the middle has other depths; see `LinesOfSight`. The attributes come from the
+gate) otherwise. Coordinates are the pixels' own, ``gate`` (0, 1, ...), and ``gate_start`` and ``gate_width`` [ns]
+between half heights. ``gate_depth`` is the depth [m] of the gate's middle on the receiver's axis, NaN where the surface
+echo time is unknown. In the other pixels the middle has other depths; see `LinesOfSight`. The attributes come from the
 result and the gate train.
 """
 
@@ -60,15 +60,15 @@ def train_from_options(
     jitter_ns: Annotated[float, Option("Standard deviation of the gates' opening", 0, unit="ns")] = 0.0,
     pulses: Annotated[int, Option("Pulses accumulated in a gate", 1, 10**9)] = 1,
 ) -> GateTrain:
-    """Build a gate train from the options of the command ``gates``.
+    """Build a gate train from the command ``gates``'s options.
 
     Parameters
     ----------
     attributes : mapping
-        Attributes of a result, with the lidar geometry if the start is a depth.
+        A result's attributes, with the lidar geometry if the start is a depth.
     start_ns, start_depth_m, start_range_m : float, optional
-        Half height of the first gate's rising edge, as a time [ns], or the time of echoes from a depth below the mean
-        sea level or a range from the lidar on the receiver's axis [m]; exactly one of them.
+        Half height of the first gate's rising edge: its time [ns], or the depth below the mean sea level or range from
+        the lidar on the receiver's axis whose echo arrives then [m]; exactly one.
 
     Raises
     ------
@@ -116,9 +116,9 @@ def build_gates(
 ) -> xr.Dataset:
     """Label the energies in gates, summed over their pulses, and their standard errors [J] as a gate stack.
 
-    They have the shape (row, column, gate) or (pixel, gate). The pixels of an imager may be in one axis, in row-major
-    order. With the coordinate ``frame`` that dimension is first. Coordinates and attributes are those of a result; the
-    coordinate ``time`` is ignored. Raises `UserError` if the energies have another shape.
+    They have the shape (row, column, gate) or (pixel, gate). An imager's pixels may be in one axis, in row-major order.
+    With the coordinate ``frame`` that dimension is first. Coordinates and attributes are a result's; the coordinate
+    ``time`` is ignored. Raises `UserError` if the energies have another shape.
     """
     pixels = xr.Dataset(coords={name: value for name, value in coords.items() if name != "time"})
     dims = ("row", "column") if "row" in pixels.sizes else ("pixel",)
@@ -154,9 +154,9 @@ def build_gates(
 
 
 def add_gate_derivatives(stack: xr.Dataset, slopes: ArrayLike, stderr: ArrayLike) -> xr.Dataset:
-    """Return a gate stack from `build_gates` with the derivatives of its energies by parameters.
+    """Return a gate stack from `build_gates` with its energies' derivatives by parameters.
 
-    The derivatives and their standard errors are in J per unit of the parameter, shape (parameter, pixel, gate).
+    The derivatives and their standard errors are in J per parameter unit, shape (parameter, pixel, gate).
     """
     energy = stack["gate_energy"]
     arrays = {
@@ -167,9 +167,9 @@ def add_gate_derivatives(stack: xr.Dataset, slopes: ArrayLike, stderr: ArrayLike
 
 
 def average_frames(stack: xr.Dataset) -> xr.Dataset:
-    """Return the mean over the frames of a gate stack, whose standard errors are independent; one without frames stays.
+    """Return the mean over a gate stack's frames, whose standard errors are independent; one without frames stays.
 
-    Coordinates of the frames, such as their times, are left out.
+    The frames' coordinates, such as their times, are left out.
     """
     if "frame" not in stack.dims:
         return stack
@@ -210,7 +210,7 @@ def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis)
 
 
 def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dataset:
-    """Return the gates of a dataset, with their derivatives if it has any, without its time bins; ``gate`` is last.
+    """Return a dataset's gates, with their derivatives if it has any, without its time bins; ``gate`` is last.
 
     Several frames give their mean, `average_frames`. Raises `UserError` if it has no gates, or dimensions other than
     (row, column, gate) or (pixel, gate); `place` names it.
@@ -259,5 +259,5 @@ def as_stack(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def has_frames(dataset: xr.Dataset) -> bool:
-    """Return whether a dataset has frames of a camera: a signal over gates. A record in time may have gates beside."""
+    """Return whether a dataset has camera frames: a signal over gates. A record in time may have gates beside."""
     return "signal" in dataset and "gate" in dataset["signal"].dims

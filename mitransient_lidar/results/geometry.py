@@ -1,6 +1,6 @@
-"""Lidar geometry and other numbers, read back from the coordinates and attributes of a dataset.
+"""Lidar geometry and other numbers, read back from a dataset's coordinates and attributes.
 
-A pixel's line of sight is the mean direction of the light that it sees directly, weighted with the beam. A result has,
+A pixel's line of sight is the mean direction from which it sees light directly, weighted with the beam. A result has,
 over its pixels, the coordinates ``sight_x`` and ``sight_y`` [mrad], ``off_nadir`` [degree], ``surface_time`` and
 ``surface_spread`` [ns], ``depth_per_ns`` [m/ns] and ``beam_share``; see `LinesOfSight`.
 """
@@ -59,9 +59,9 @@ class LinesOfSight:
         """Read the lines of sight in a result or gate stack.
 
         Without their coordinates, they go to the pixel centres, with the mean arrival in the attribute
-        ``surface_time_ns`` if it is known. Arrays have the dimensions `dims`, flattened to one, by default those of the
-        pixels: ``pixel``, or ``row`` and ``column``. Raises `UserError` if coordinates and attributes do not determine
-        the geometry.
+        ``surface_time_ns`` if it is known. Arrays have the dimensions `dims`, flattened to one, by default the pixels':
+        ``pixel``, or ``row`` and ``column``. Raises `UserError` if coordinates and attributes do not determine the
+        geometry.
         """
         if dims is None:
             dims = ("row", "column") if "row" in dataset.dims else ("pixel",)
@@ -103,7 +103,7 @@ class LinesOfSight:
         }
 
     def at(self, index: slice | npt.NDArray[np.intp]) -> LinesOfSight:
-        """Return some of the lines of sight."""
+        """Return some lines of sight."""
         return LinesOfSight(**{name: values[index] for name, values in vars(self).items()})
 
     def combined(self) -> LinesOfSight:
@@ -122,21 +122,21 @@ class LinesOfSight:
         return LinesOfSight(**{name: values.reshape(shape) for name, values in vars(self).items()})
 
     def depth_of_time(self, time_ns: npt.ArrayLike) -> FloatArray:
-        """Return the depths [m] below the mean sea level of echoes at times [ns], shape (pixels, ...)."""
+        """Return the depths [m] below the mean sea level for echoes at times [ns], shape (pixels, ...)."""
         return self.depth_of_delay(np.asarray(time_ns, np.float64) - _columns(self.surface_time, np.ndim(time_ns)))
 
     def depth_of_delay(self, delay_ns: npt.ArrayLike) -> FloatArray:
-        """Return the depths [m] of delays from the surface [ns], shape (pixels, ...)."""
+        """Return the depths [m] for delays from the surface [ns], shape (pixels, ...)."""
         return np.asarray(np.asarray(delay_ns, np.float64) * _columns(self.depth_per_ns, np.ndim(delay_ns)))
 
     def time_of_depth(self, depth: npt.ArrayLike) -> FloatArray:
-        """Return the arrival times [ns] of echoes from depths [m] below the mean sea level, shape (pixels, ...)."""
+        """Return the arrival times [ns] for echoes from depths [m] below the mean sea level, shape (pixels, ...)."""
         size = max(np.ndim(depth), 1)
         delay = np.asarray(depth, np.float64) / _columns(self.depth_per_ns, size)
         return np.asarray(_columns(self.surface_time, size) + delay)
 
     def spreading(self, geometry: LidarGeometry, time_ns: FloatArray) -> FloatArray:
-        """Return the solid angle of the aperture at times [ns], shape (time,), over that at the surface; 1 above it.
+        """Return the aperture's solid angle at times [ns], shape (time,), relative to the surface; 1 above it.
 
         The shape is (pixels, time). The geometry provides the height and the refractive index.
         """
@@ -150,10 +150,9 @@ def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "
     """Read a lidar's geometry from a result's attributes.
 
     They are ``altitude`` [m], ``off_nadir_deg``, ``refractive_index``, ``group_index`` and, optionally,
-    ``surface_time_ns``, the mean arrival over the pixels. This is the surface echo time if `surface` is ``measured``;
-    with ``level``, it is that of the mean sea level on the axis, and with ``any`` the first of these that is known.
-    Raises `UserError` if an attribute is missing, is not a number of at least 0 or out of range, or the lidar is under
-    water.
+    ``surface_time_ns``, the mean arrival over the pixels. This is the surface echo time if `surface` is ``measured``.
+    With ``level``, it is the mean sea level's on the axis, and with ``any`` the first of these that is known. Raises
+    `UserError` if an attribute is missing, negative, no number or out of range, or the lidar is under water.
     """
     if surface == "measured":
         required_number(attributes, "surface_time_ns")
@@ -169,9 +168,9 @@ def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "
 def lidar_system(attributes: Attributes, efficiency: float | None = None) -> LidarSystem:
     """Return the lidar equation's system, with the whole beam's energy and the open aperture area.
 
-    The efficiency, 0 to 1, includes transmitter, receiver and two-way transmittance of the atmosphere; by default it is
-    the attribute ``two_way_efficiency``. `share_in_view` is the share of the energy that the pixels see. Raises
-    `UserError` if the efficiency is out of range or unknown, or another attribute is missing.
+    The efficiency, 0 to 1, includes transmitter, receiver and two-way atmospheric transmittance; by default it is the
+    attribute ``two_way_efficiency``. `share_in_view` is the share of the energy that the pixels see. Raises `UserError`
+    if the efficiency is out of range or unknown, or another attribute is missing.
     """
     energy = 1e-3 * required_number(attributes, "pulse_energy_mj") * two_way_efficiency(attributes, efficiency)
     geometry = lidar_geometry(attributes)
@@ -181,7 +180,7 @@ def lidar_system(attributes: Attributes, efficiency: float | None = None) -> Lid
 
 
 def spot_diameter(attributes: Attributes) -> float:
-    """Return the diameter of the receiver's field of view on the sea surface [m]."""
+    """Return the receiver's field-of-view diameter on the sea surface [m]."""
     return 1e-3 * required_number(attributes, "field_of_view_mrad") * lidar_geometry(attributes).slant_range
 
 
@@ -192,16 +191,15 @@ def pose_of(attributes: Attributes, name: str = "receiver_pose") -> Pose | None:
 
 
 def _columns(values: FloatArray, dimensions: int) -> FloatArray:
-    """Return pixel values for arrays with a number of dimensions, the pixels first."""
+    """Return pixel values for arrays with so many dimensions, the pixels first."""
     return values.reshape(-1, *(1,) * (dimensions - 1))
 
 
 def share_in_view(dataset: xr.Dataset) -> FloatArray:
-    """Return the share of the beam's energy in all pixels of a result over ``pixel``, shape () or (shots,).
+    """Return the share of the beam's energy in all pixels in a result over ``pixel``, shape () or (shots,).
 
-    It is the sum over the coordinate ``beam_share``: light that overlapping pixels share counts in each, as in the sum
-    of their waveforms. Without the coordinate, it is the share of a Gaussian beam in the middle of a full field of
-    view.
+    It is the sum over the coordinate ``beam_share``: light that overlapping pixels share counts in each, as in their
+    waveforms' sum. Without the coordinate, it is a Gaussian beam's share in the middle of a full field of view.
     """
     if "beam_share" in dataset.coords and "pixel" in dataset["beam_share"].dims:
         share = np.asarray(dataset["beam_share"].sum("pixel", skipna=False).values, dtype=np.float64)
@@ -214,7 +212,7 @@ def share_in_view(dataset: xr.Dataset) -> FloatArray:
 
 
 def two_way_efficiency(attributes: Attributes, given: float | None = None) -> float:
-    """Return a given efficiency of optics and atmosphere, or the lidar's; see `lidar_system`."""
+    """Return a given efficiency for optics and atmosphere, or the lidar's; see `lidar_system`."""
     if given is not None:
         return in_range("efficiency", given, 0, 1)
     if "two_way_efficiency" not in attributes:

@@ -4,7 +4,7 @@ A frame keeps its digital numbers. Energies are numbers from 0 to 65535, the lar
 description states the energy per number [J]. Pixels without a grid form an image one row high. A TIFF file has one page
 for each frame and gate, all gates in the first frame first; PNG files are numbered, ``<name>_gate000.png``, for several
 frames ``<name>_frame0000_gate000.png``. Each has a description in JSON: ``frame`` and ``gate``, its ``gate_start_ns``
-and ``gate_width_ns``, ``gate_depth_m`` if it is known, and the ``unit`` of a number with its ``scale``.
+and ``gate_width_ns``, ``gate_depth_m`` if it is known, and a number's ``unit`` with its ``scale``.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def write(dataset: xr.Dataset, path: Path) -> list[Path]:
 
 
 def _numbers(dataset: xr.Dataset, path: Path) -> tuple[npt.NDArray[np.uint16], float]:
-    """Return 16-bit numbers over (frame, gate, row, column), and the value of one [J or digital number]."""
+    """Return 16-bit numbers over (frame, gate, row, column), and the value for one [J or digital number]."""
     is_frames = has_frames(dataset)
     if not is_frames and "gate_energy" not in dataset:
         raise UserError(f"cannot write {path}: a {path.suffix} file holds gates or frames of a camera")

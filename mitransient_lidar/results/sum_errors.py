@@ -1,4 +1,4 @@
-"""Standard errors of sums over a render's bins, whose passes correlate the errors between different bins."""
+"""Standard errors for sums over a render's bins, whose passes correlate the errors between different bins."""
 
 from __future__ import annotations
 
@@ -39,8 +39,7 @@ class BlockCorrelation:
     def covariance(self, scaled: FloatArray, first: int = 0) -> FloatArray:
         """Return the covariances between k sums over the same bins, shape (..., k, k).
 
-        `scaled` are errors of neighbouring bins times their weights, shape (..., k, bins), from the bin `first` of the
-        record on.
+        `scaled` are neighbouring bins' errors times their weights, shape (..., k, bins), from bin `first` on.
         """
         part = slice(first, first + scaled.shape[-1])
         own, scaled = self.block[part], scaled / np.broadcast_to(self.inflation, self.block.shape)[part]
@@ -51,7 +50,7 @@ class BlockCorrelation:
         return np.asarray(between + (scaled * self._alone[own]) @ np.swapaxes(scaled, -1, -2))
 
     def variances(self, scaled: FloatArray, places: IntArray) -> FloatArray:
-        """Return the variances of sums, shape (n,), each over its own bins `places`, shape (n, bins)."""
+        """Return the variances for sums, shape (n,), each over its own bins `places`, shape (n, bins)."""
         own = self.block[places]
         scaled = scaled / np.broadcast_to(self.inflation, self.block.shape)[places]
         local = own - own.min(axis=1, keepdims=True)
@@ -68,7 +67,7 @@ class BlockCorrelation:
 
     @property
     def _alone(self) -> FloatArray:
-        """Part of the variance that a bin in each block has on its own: a bin is fully correlated with itself."""
+        """Variance part that a bin in each block has on its own: a bin is fully correlated with itself."""
         return np.asarray(1 - np.diagonal(self.correlation))
 
 
@@ -85,7 +84,7 @@ class SumErrors:
     def of(cls, dataset: xr.Dataset) -> SumErrors | None:
         """Return a result's statement, None without one.
 
-        Raises `UserError` if the result states another kind of correlation.
+        Raises `UserError` if the result states another correlation kind.
         """
         bins, inflation = (np.atleast_1d(np.asarray(dataset.attrs.get(name, []), np.float64)) for name in _CURVE)
         curve = np.stack([bins, inflation]) if bins.size and bins.shape == inflation.shape else np.zeros((2, 0))
@@ -101,7 +100,7 @@ class SumErrors:
         return cls(BlockCorrelation(correlation, np.searchsorted(edges, time)), curve)
 
     def of_sum(self, deviation: FloatArray, weights: FloatArray, first: int = 0) -> FloatArray:
-        """Return the standard error of a weighted sum over neighbouring bins, from the bin `first` of the record on.
+        """Return the standard error for a weighted sum over neighbouring bins, from the record's bin `first` on.
 
         Standard errors have the shape (..., bins), weights this one or (bins,).
         """
@@ -114,10 +113,10 @@ class SumErrors:
         return np.asarray(np.sqrt(np.maximum(variance, 0)))
 
     def of_means(self, deviation: FloatArray, run: int, passes: int) -> FloatArray:
-        """Return the error ratio of means over `run` bins about each bin to independent bins.
+        """Return the error ratio to independent bins for means over `run` bins about each bin.
 
-        The ratio is for the mean over pixels of the squared errors, shape (pixels, time); it has the shape (time,). A
-        few passes may show correlations far below the true ones: the ratio is then at least the median one.
+        The ratio is for the squared errors' mean over pixels, shape (pixels, time); it has the shape (time,). A few
+        passes may show correlations far below the true ones: the ratio is then at least the median one.
         """
         count = deviation.shape[-1]
         least = max(self._of_curve(run), 1.0) if passes < _FEW_PASSES else _LEAST_RATIO
@@ -135,10 +134,10 @@ class SumErrors:
         return np.maximum(ratio, least)
 
     def median_curve(self, mean: FloatArray, stderr: FloatArray) -> tuple[list[int], list[float]]:
-        """Return numbers of bins, 1, 2, 4, ..., and the median error ratios of their sums to independent bins.
+        """Return numbers of bins, 1, 2, 4, ..., and their sums' median error ratios to independent bins.
 
         Mean and standard error are bin values, shape (pixels, time). Sums below a millionth of the brightest one, and
-        more than `_SUMS` of each number, are left out.
+        more than `_SUMS` for each number, are left out.
         """
         typical, light = np.sqrt(np.mean(stderr**2, axis=0)), np.mean(mean, axis=0)
         bins, inflation = [1], [1.0]

@@ -1,7 +1,7 @@
 """Waveforms that lidars have recorded, from full-waveform LAS and LAZ files and from PulseWaves files.
 
-Their datasets are those of a receiver's record: ``signal`` over (shot, pixel, time), with a channel as a pixel and the
-number of a waveform as its shot. As in flights, ``time`` counts from the start of the first sample of each waveform.
+Their datasets are like a receiver's record: ``signal`` over (shot, pixel, time), with a channel as a pixel and a
+waveform's number as its shot. As in flights, ``time`` counts from the start of each waveform's first sample.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _JOINED: dict[str, Any] = {"join": "outer", "combine_attrs": "override", "fill_v
 
 
 def is_waveform_file(path: object) -> bool:
-    """Return whether a path has the suffix of a file of this module: .las, .laz, .pls or .wvs."""
+    """Return whether a path has a suffix that this module reads: .las, .laz, .pls or .wvs."""
     return isinstance(path, (str, os.PathLike)) and Path(path).suffix.lower() in (*_LAS, *_PULSE_WAVES)
 
 
@@ -56,7 +56,7 @@ def waveform_chunks(
     *,
     size: int = 4096,
 ) -> Iterator[xr.Dataset]:
-    """Return the waveforms of a file, of any number, in the memory of one part.
+    """Return a file's waveforms, any number, in the memory for one part.
 
     Parameters
     ----------
@@ -64,22 +64,22 @@ def waveform_chunks(
         LAS or LAZ file of point format 4, 5, 9 or 10, with its packets in it or in a ``.wdp`` file beside it; or
         PulseWaves file ``.pls`` with its ``.wvs``. Each waveform is there once, however many returns refer to it.
     waveforms : tuple of int, optional
-        First one, and the one after the last or None. Their numbers are in the order of the points, of PulseWaves those
-        of the pulses, from 0.
+        First one, and the one after the last or None. Their numbers are in the points' order, for PulseWaves in the
+        pulses', from 0.
     channel : int or str, optional
         Channel, all by default: the scanner channel of point formats 9 and 10, the user data of 4 and 5, the channel of
-        PulseWaves' sampling. ``'FIELD=VALUE'`` is a value of another field of the points, such as ``user_data``,
-        ``pixel`` or ``descriptor``, the index of the wave packet descriptor.
+        PulseWaves' sampling. ``'FIELD=VALUE'`` is a value in another field of the points, such as ``user_data``,
+        ``pixel`` or ``descriptor``, the wave packet descriptor's index.
     lidar : mapping of str to float, optional
-        Attributes that the file does not have, of `STATED`: ``sea_level`` is the height of the mean sea level in the
-        coordinates of the file [m], by default that of the first return of each waveform.
+        Attributes that the file does not have, from `STATED`: ``sea_level`` is the mean sea level's height in the
+        file's coordinates [m], by default the height of each waveform's first return.
     size : int
         Most points or pulses in memory, at least 1.
 
     Returns
     -------
     iterator of xarray.Dataset
-        Waveforms of one channel, length and spacing: ``signal`` [V], or counts where the file has no gain,
+        Waveforms with one channel, length and spacing: ``signal`` [V], or counts where the file has no gain,
         ``saturated``, whether a sample is the largest count, and the coordinates of `geometry.LinesOfSight`, with
         ``surface_time`` as in ``time``. ``sample_start_ns`` is the start of the first sample after the pulse, as the
         file has it or by ``altitude`` and ``sea_level``; else NaN.
@@ -117,7 +117,7 @@ def waveform_chunks(
 def _datasets(
     path: Path, blocks: Iterable[WaveformBlock], channel: int | None, known: Mapping[str, float], nothing: str
 ) -> Iterator[xr.Dataset]:
-    """Yield the waveforms of each channel or of one; raise `UserError` with a sentence if there is none."""
+    """Yield each channel's waveforms, or one's; raise `UserError` with a sentence if there is none."""
     found = False
     for block in blocks:
         for one in np.unique(block.channel) if channel is None else [channel]:
@@ -129,9 +129,9 @@ def _datasets(
 
 
 def read_waveforms(path: str | os.PathLike[str], *selection: Any, **options: Any) -> xr.Dataset:
-    """Return waveforms of a file in one dataset; the arguments are those of `waveform_chunks`.
+    """Return a file's waveforms in one dataset, with `waveform_chunks`'s arguments.
 
-    Several channels are pixels of the shots that each of them has, whose number is that of the first channel. They are
+    Several channels are pixels in the shots that each channel has; the shot number is the first channel's. They are
     drawn side by side (``angle_x``, ``angle_y``), since files do not have their angles. Shorter waveforms end in NaN.
 
     Raises UserError as in `waveform_chunks`, and if the waveforms take too much memory, their spacing differs, or
@@ -159,7 +159,7 @@ def read_waveforms(path: str | os.PathLike[str], *selection: Any, **options: Any
 
 
 def placed_in_time(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a dataset with times after the pulse, if these are those of a file, known and alike for all waveforms."""
+    """Return a dataset with times after the pulse, if a file has these, known and alike for all waveforms."""
     start = dataset["sample_start_ns"].values if FILE in dataset.attrs else np.empty(0)
     if not start.size or not np.ptp(start) < _SAME_START * dataset.attrs["bin_width_ns"]:  # NaN where unknown
         return dataset
@@ -168,7 +168,7 @@ def placed_in_time(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def mean_above_dark(dataset: xr.Dataset) -> xr.DataArray:
-    """Return the mean of the waveforms of this module, less its level in the first half before the surface, by pixel.
+    """Return the mean over this module's waveforms, minus its level in the first half before the surface, by pixel.
 
     Times are those after the pulse, if all waveforms have the same.
     """
@@ -186,7 +186,7 @@ def mean_above_dark(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def check_measurable(dataset: xr.Dataset) -> None:
-    """Raise `UserError` if a dataset of this module lacks what echoes and depths need, which a user must state."""
+    """Raise `UserError` if this module's dataset lacks what echoes and depths need, which a user must state."""
     if FILE not in dataset.attrs:
         return
     if np.isnan(dataset["signal"].values).any():
@@ -203,7 +203,7 @@ def check_measurable(dataset: xr.Dataset) -> None:
 
 
 def _dataset(path: Path, block: WaveformBlock, rows: np.ndarray[Any, Any], known: Mapping[str, float]) -> xr.Dataset:
-    """Return some waveforms of a block, of one channel."""
+    """Return some waveforms in a block, from one channel."""
     width, values, counts = block.spacing_ns, {**_USUAL, **known}, block.counts[rows]
     place, step, first = block.place[rows], block.step[rows], block.first_ns[rows]
     level, speed = values.get("sea_level", np.nan), np.linalg.norm(step, axis=1)
@@ -244,5 +244,5 @@ def _dataset(path: Path, block: WaveformBlock, rows: np.ndarray[Any, Any], known
 
 
 def _early_surface(times: np.ndarray[Any, Any]) -> dict[str, float]:
-    """Return the attribute of a surface that few others come before, if it is known."""
+    """Return the attribute for a surface that few others come before, if it is known."""
     return {"surface_time_ns": float(np.nanquantile(times, _EARLY))} if np.isfinite(times).any() else {}

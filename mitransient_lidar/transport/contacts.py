@@ -96,7 +96,7 @@ def separate_contacts(scene: WaterScene) -> list[mi.Shape]:
 
 
 def _neighbours(shapes: Sequence[mi.Shape], surfaces: Sequence[mi.Shape]) -> list[_Pair]:
-    """Return pairs of shapes whose bounding boxes touch, except pairs of two water surfaces."""
+    """Return shape pairs whose bounding boxes touch, except pairs of water surfaces."""
     if len(shapes) < 2:
         return []
     low, high = _corners(shapes)

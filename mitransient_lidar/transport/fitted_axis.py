@@ -70,7 +70,7 @@ def fitted_axis(
 def _light_above_water(
     scene: WaterScene, transmitter: Transmitter, gates: GatePlan | None, shifts: Iterable[tuple[float, float]]
 ) -> tuple[float, float, str, float]:
-    """Return the times of the first and the last light [ns], the source of the last light, and the lead of land.
+    """Return the first and the last light's times [ns], the last light's source, and land's lead.
 
     Land and other solids above the sea return the first light earlier than it by this time [ns].
     """
@@ -142,8 +142,8 @@ def _light_under_water(
 def total_reflection_ns(view: Rays, beam: Rays) -> float:
     """Return when light of a lidar under water first meets the sea beyond its critical angle, and comes back [ns].
 
-    Infinite where less than a tenth of beam and of view does so. Reflection alone shows the scene beyond, by few paths
-    and in cells about an axis that light has left: it is not rendered.
+    Infinite where less than a tenth of beam and view does so. Reflection alone shows the scene beyond, by few paths and
+    in cells about an axis that light has left: it is not rendered.
     """
     found, scene = [np.inf], view.scene
     lidar = [opaque_point(rays.pose.origin) for rays in (beam, view)]
@@ -205,7 +205,7 @@ def _name(shape: mi.Shape) -> str:
 
 
 def _triangles(shape: mi.Shape) -> FloatArray:
-    """Return the triangles of a mesh or rectangle, or the top and bottom of another shape's bounding box [m]."""
+    """Return a mesh's or rectangle's triangles, or the top and bottom of another shape's bounding box [m]."""
     known = mi.traverse(shape)
     if "vertex_positions" in known:
         vertices = np.array(known["vertex_positions"], dtype=np.float64).reshape(-1, 3)

@@ -241,7 +241,7 @@ class BeamSampler:
         self.use_view = float(share[0]) < _SMALLEST_SHARE
 
     def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> tuple[mi.Point2f, mi.Float]:
-        """Return tangent-plane angles of photons number `index` of `count`, and the energy [J] that each represents."""
+        """Return tangent-plane angles for photon numbers `index` among `count`, and each photon's energy [J]."""
         transmitter = self.transmitter
         if not self.use_view:
             angle_x, angle_y = transmitter.sample_tangent(stratified_point(index, count, rng))

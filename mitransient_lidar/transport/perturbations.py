@@ -1,10 +1,10 @@
-"""Derivatives of path contributions by properties of water and solids.
+"""Derivatives of path contributions by water and solid properties.
 
-A path with lengths L in the layers, n scattering events by the angles theta and m reflections by a solid contributes in
-proportion to exp(-c L) b^n times the product of p(theta) and reflectance^m. Its logarithm is a sum over the path, and
-so is its derivative: -L by c (b fixed), n / b by b (c fixed), and so on. The contribution's derivative is contribution
-times sum, from the same paths (perturbation Monte Carlo: Hayakawa et al. 2001, doi:10.1364/OL.26.001335). The weights
-between techniques that find the same path add up to 1 in any water, and are not differentiated.
+A path has lengths L in the layers, n scattering events by the angles theta and m reflections by a solid. It contributes
+in proportion to exp(-c L) b^n times the product of p(theta) and reflectance^m. Its logarithm is a sum over the path,
+and so is its derivative: -L by c (b fixed), n / b by b (c fixed), and so on. The contribution's derivative is
+contribution times sum, from the same paths (perturbation Monte Carlo: Hayakawa et al. 2001, doi:10.1364/OL.26.001335).
+The weights between techniques that find the same path add up to 1 in any water, and are not differentiated.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class Perturbations:
                     self._tables[layer.tables].add(change, layer)
 
     def _group(self, change: LayerChange) -> int:
-        """Return the number of the first tables that can include a change, or of new ones."""
+        """Return the number of the first tables that can include a change, or of new tables."""
         for number, tables in enumerate(self._tables):
             if tables.takes(change):
                 return number

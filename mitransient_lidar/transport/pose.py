@@ -76,8 +76,9 @@ class RelativePose:
     """A pose relative to a reference point in the scene: accurate from orbit in single precision.
 
     Distances are relative to the reference point r. With the pose's origin o and a point p,
-    |p - o| - |r - o| = (p - r) . (p - r + 2 (r - o)) / (|p - o| + |r - o|). Single precision has rounding errors of
-    3 cm in coordinates and distances of 500 km, but of less than 0.1 mm in such differences to points within 100 m.
+    |p - o| - |r - o| = (p - r) . (p - r + 2 (r - o)) / (|p - o| + |r - o|). Single precision rounds
+    coordinates and distances of 500 km with 3 cm errors. Such differences to points within 100 m have errors below
+    0.1 mm.
 
     `pose`: transmitter or receiver. `reference`: reference point [m], shape (3,).
     """

@@ -51,7 +51,7 @@ def tiled(tree: Tree, copies: int) -> Tree:
 
 
 def starts(shots: int, size: int, copies: int = 1) -> mi.UInt32:
-    """Return the number of the first of `size` entries in each shot, of which several copies in turn have the same."""
+    """Return the number of the first of `size` entries in each shot; several copies in turn share it."""
     if shots * copies == 1:
         return mi.UInt32(0)
     return aligned(mi.UInt32, np.repeat(np.arange(shots) * size, copies))
@@ -111,8 +111,8 @@ def pass_streams(seed: int, purpose: int, count: int) -> mi.PCG32:
 def stratified_point(index: mi.UInt32, count: int | mi.UInt64, rng: mi.PCG32) -> mi.Point2f:
     """Return a random point in stratum number `index` of `count` in the unit square.
 
-    The strata are equal pieces of a Z-order curve (Morton 1966): neighbours in number are neighbours in the square, so
-    that the rays in a packet and their memory accesses stay together.
+    The strata are equal pieces of a Z-order curve (Morton 1966). Neighbours in number are neighbours in the square: the
+    rays in a packet and their memory accesses stay together.
     """
     # Dr.Jit compiles another kernel for every number by which it divides.
     strata = dr.opaque(mi.UInt64, count) if isinstance(count, int) else count

@@ -48,7 +48,7 @@ Vector = TypeVar("Vector", mi.Vector3f, mi.Point3f, mi.Normal3f)
 class ScenePart:
     """Shapes that shots meet at a place of their own.
 
-    Points of the lidar's frame are turned about the vertical, by an angle whose cosine and sine are `turn`, and then
+    Points in the lidar's frame are turned about the vertical, by an angle with cosine and sine `turn`, and then
     displaced [m] to the shapes. Without `turn` they are only displaced.
     """
 
@@ -127,8 +127,8 @@ class WaterScene:
     def bottoms(self) -> list[mi.Shape]:
         """Solids that are the bottom, or a part of it; all others are targets.
 
-        The shorter horizontal side of a bottom's bounding box is at least the width of the field of view at its
-        distance, and at least a quarter of the largest solid's.
+        A bottom's bounding box has a shorter horizontal side of at least the field of view's width at its distance, and
+        at least a quarter of the largest solid's.
         """
         boxes = [box_of(solid) for solid in self.solids]
         sides = [float((high - low)[:2].min()) for low, high in boxes]
@@ -156,7 +156,7 @@ class WaterScene:
 
     @property
     def empty_heights(self) -> tuple[float, float]:
-        """Heights of the highest solid's top and of the sea's lowest point: no shape lies between [m]."""
+        """Heights of the highest solid's top and the sea's lowest point: no shape lies between [m]."""
         highest = max((float(solid.bbox().max.z) for solid in self.solids), default=-np.inf)
         return highest, -np.inf if self.sea_heights is None else self.sea_heights[0]
 
@@ -201,9 +201,9 @@ class WaterScene:
     def facet_size(self) -> float:
         """Length over which slopes of the sea surface change [m].
 
-        A quarter of the shortest waves that the beam needs or, if longer, the cell side; in meshes from other plugins
-        the mean side of a cell, a pair of triangles. Shorter waves for an image's pixels, and cells finer than their
-        waves, do not count.
+        A quarter of the shortest waves that the beam needs or, if longer, the cell side; in other plugins' meshes the
+        mean side of a cell, a triangle pair. Shorter waves for an image's pixels, and cells finer than their waves, do
+        not count.
         """
         sizes = [
             max(surface.sea.cell_size, _FACET_PER_WAVE * surface.sea.beam_wave)
@@ -277,8 +277,8 @@ class WaterScene:
     def first_points(self, pose: KernelPose, angles: mi.Point2f, direction: mi.Vector3f) -> tuple[mi.Point3f, mi.Float]:
         """Return where paths from a pose start [m], at tangent-plane angles, and their relative lengths there [m].
 
-        Paths from more than 10 km above the scene start 1 m above all shapes: traced from farther away in single
-        precision, rays would pass between the triangles of the sea, 1.6 % of them from 500 km at 20 degrees.
+        Paths from more than 10 km above the scene start 1 m above all shapes. Traced from farther away in single
+        precision, rays would pass between the sea's triangles: 1.6 % from 500 km at 20 degrees.
         """
         origin, relative = pose.point, self.relative(pose)
         top = float(self.mitsuba_scene.bbox().max.z) + _CLEARANCE

@@ -61,7 +61,7 @@ def find_lidar_scene(
 ) -> LidarScene:
     """Find the parts in a loaded scene; sun and sky are ignored. `receiver` replaces the sensor's own.
 
-    `axis` gives the time bins that the film does not; without it they contain the light at all lidar positions, above
+    `axis` states the time bins that the film does not. Without it they contain the light at all lidar positions, above
     water displaced by `shifts` (x, y) [m].
 
     Raises UserError when a part is missing, not supported, or there are several where one is allowed.

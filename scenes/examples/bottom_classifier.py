@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from matplotlib.figure import Figure
 from sklearn.ensemble import HistGradientBoostingClassifier
 
 import mitransient_lidar
@@ -23,6 +22,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import has_echo
 from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
 from mitransient_lidar.campaigns.store import DONE
 from mitransient_lidar.campaigns.sweep import render_row
+from mitransient_lidar.plots import drawing, palette
 
 #: Bins on both sides of a place that the classifier sees, and bins between places.
 REACH, STEP = 24, 2
@@ -35,9 +35,9 @@ TOLERANCE_M = 0.5
 
 
 _LABELS = {
-    "shipped": "waveforms command",
-    "classifier": "classifier, as many false alarms",
-    "at 1 %": "classifier, 1 % false alarms",
+    "shipped": "command echoes",
+    "classifier": "classifier, false-alarm rate at most as echoes",
+    "at 1 %": "classifier, false-alarm rate 1 %",
 }
 
 
@@ -167,7 +167,7 @@ def report(
     rows = [("all", np.ones(len(depths), dtype=bool))]
     for name, values, edges in (("c z", lengths, (0, 2, 4, 6, 8, 12, 30)), ("z (m)", depths, (2, 3, 4, 20))):
         rows += [(f"{name} {a:g} to {b:g}", (values >= a) & (values < b)) for a, b in itertools.pairwise(edges)]
-    print(f"{'':<16}{'waveforms':>10}", *(f"{name:>12}" for name in found), f"{'only shipped':>14}")
+    print(f"{'':<16}{'echoes':>10}", *(f"{name:>12}" for name in found), f"{'only shipped':>14}")
     print(f"{'false alarms':<16}{'':>10}", *(f"{one.mean():>12.3f}" for one in alarms.values()))
     medians = [np.median(errors_m[name][one]) for name, one in found.items()]
     print(f"{'median error (m)':<16}{'':>10}", *(f"{one:>12.3f}" for one in medians))
@@ -181,9 +181,9 @@ def draw(data: xr.Dataset, found: dict[str, np.ndarray], path: Path) -> None:
     """Draw the shares of bottoms found against the optical depth of the bottom."""
     lengths = (data["attenuation"] * data["bottom_depth"]).values
     edges = np.quantile(lengths, np.linspace(0, 1, 13))
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    figure = drawing.new_figure(path, 7.0, 4.2)
     ax = figure.subplots()
-    for name, each in found.items():
+    for (name, each), mark in zip(found.items(), palette.marked(len(found)), strict=True):
         shares, errors, middles = [], [], []
         for a, b in itertools.pairwise(edges):
             rows = (lengths >= a) & (lengths <= b)
@@ -191,10 +191,10 @@ def draw(data: xr.Dataset, found: dict[str, np.ndarray], path: Path) -> None:
             shares.append(of_runs.mean())
             errors.append(of_runs.std(ddof=1) / np.sqrt(len(of_runs)))
             middles.append(np.sqrt(a * b))
-        ax.errorbar(middles, shares, errors, marker="o", label=_LABELS[name])
-    ax.set(xlabel="attenuation x depth of the bottom", ylabel=f"bottoms found to {TOLERANCE_M:g} m", xscale="log")
+        ax.errorbar(middles, shares, errors, markerfacecolor="none", label=_LABELS[name], **mark)
+    ax.set(xlabel="attenuation times bottom depth", ylabel=f"share of bottoms found to {TOLERANCE_M:g} m", xscale="log")
     ax.legend(frameon=False)
-    figure.savefig(path, dpi=160)
+    drawing.save(figure, path)
     print(path)
 
 

@@ -2,8 +2,8 @@
 
 The page shows a gate image, steps and plays through the gates, maps depths, and plots the records of selected pixels.
 For waveforms, time bins replace the gates. Its parts are ``page.html``, ``page.css`` and the ``.js`` files. The arrays
-are embedded as base64 from raw deflate data of little-endian float32 numbers: the first bytes of all numbers, then the
-second ones, ... Many values are rounded to within 1/16 of their standard errors, and these to within 2 %.
+are embedded as base64 from raw deflate data. These contain little-endian float32 numbers: all numbers' first bytes,
+then the second ones, ... Many values are rounded to within 1/16 of their standard errors, and these to within 2 %.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
     For a shot series it is the mean, with the mean's standard error. The waveform's attribute ``units`` is W, V or 1,
     and its ``long_name`` belongs to the variable shown.
 
-    Raises UserError if it has another shape, no angles of the pixels, or attributes or times that are invalid.
+    Raises UserError if it has another shape, no pixel angles, or attributes or times that are invalid.
 
     `dataset`: a result with ``waveform``, or a record with ``signal``, over (pixel, time) or (row, column, time), after
     ``shot`` if it has shots.
@@ -116,7 +116,7 @@ _VALUE_BITS, _ERROR_BITS, _BITS_PER_ERROR = 12, 5, 3
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Encoded arrays with means over blocks of `factor` times `factor` pixels."""
+    """Encoded arrays with means over blocks with `factor` times `factor` pixels."""
 
     factor: int
     rows: int
@@ -129,11 +129,11 @@ class _Blocks:
 
 
 def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: float = 200.0) -> str:
-    """Return the text of the HTML page that shows a gate stack or waveforms.
+    """Return the HTML page that shows a gate stack or waveforms.
 
-    A page that would exceed `limit_mb` shows means over blocks of 2 by 2, 4 by 4, ... pixels, first for the waveforms,
-    and a note about it. Since pixels share photons, such a mean's error is unknown; the page shows its upper bound, the
-    mean of the errors.
+    A page that would exceed `limit_mb` shows means over 2 by 2, 4 by 4, ... pixels, first for the waveforms, and a note
+    about it. Since pixels share photons, such a mean's error is unknown; the page shows its upper bound, the mean of
+    the errors.
 
     Raises UserError if `stack` has neither gates nor a record in time, `result` has other pixels, or `limit_mb` is not
     above 0 or too small for the gates of one block (of all pixels, if they form no image).
@@ -148,11 +148,11 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
         Or camera frames, whose mean above the dark level the page shows, or a gate stack: ``gate_energy`` and
         ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the coordinates ``gate_start`` and
         ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the surface echo time is known, ``gate_depth``
-        [m]. With a result's lines of sight, pixel depths are along them, and depths of gates and times are on the
-        receiver's axis.
+        [m]. With a result's lines of sight, pixel depths are along them; gate and time depths are on the receiver's
+        axis.
     result : xarray.Dataset, optional
-        A render of the same pixels, whose ``waveform`` [W] is plotted; by default `stack` itself. Without waveforms the
-        record of a pixel is its energy in the gates.
+        A render of the same pixels, whose ``waveform`` [W] is plotted; by default `stack` itself. Without waveforms a
+        pixel's record is its energy in the gates.
     limit_mb : float
         Largest page size [MB of 1e6 bytes], above 0.
     """
@@ -284,7 +284,7 @@ def _base64(values: FloatArray) -> str:
 
 
 def packed(data: bytes, level: int = 6) -> str:
-    """Return base64 of the raw deflate data of bytes, which ``unpack.js`` reads."""
+    """Return bytes as raw deflate data in base64, which ``unpack.js`` reads."""
     packer = zlib.compressobj(level, zlib.DEFLATED, -zlib.MAX_WBITS)
     return base64.b64encode(packer.compress(data) + packer.flush()).decode("ascii")
 
@@ -306,7 +306,7 @@ def _notes(gates: _Blocks, waveforms: _Blocks | None, has_record: bool, limit_mb
 def _metadata(
     stack: xr.Dataset, record: xr.Dataset | None, gates: _Blocks, waveforms: _Blocks | None
 ) -> dict[str, Any]:
-    """Return the data of the page except the arrays, ready for JSON."""
+    """Return the page's data except the arrays, ready for JSON."""
     start, width = (np.asarray(stack[name].values, dtype=np.float64) for name in ("gate_start", "gate_width"))
     depth = known_depths(stack)
     # The depth axis is linear in time.
@@ -343,14 +343,14 @@ def _metadata(
 
 
 def _quantity(record: xr.Dataset) -> dict[str, str]:
-    """Return name and unit of a record's waveforms, with an empty unit for counts."""
+    """Return name and unit for a record's waveforms, with an empty unit for counts."""
     about = record["waveform"].attrs
     unit = str(about.get("units", "W"))
     return {"name": str(about.get("long_name", "received power")), "unit": "" if unit == "1" else unit}
 
 
 def _words(record: xr.Dataset | None, gated: xr.Dataset) -> dict[str, Any]:
-    """Return names and units of the values shown: gate values, or a record's in its time bins."""
+    """Return names and units for the values shown: gate values, or a record's in its time bins."""
     if record is None:
         about = gated["gate_energy"].attrs
         quantity = {"name": about["long_name"], "unit": about["units"]}
@@ -395,13 +395,13 @@ def _axes(stack: xr.Dataset, gates: _Blocks, shapes: list[list[list[float]]] | N
 
 
 def _colour_maps() -> dict[str, str]:
-    """Return 256 colours of each map as base64 of their red, green and blue bytes."""
+    """Return each map's 256 colours, their red, green and blue bytes as base64."""
     tables = {name: matplotlib.colormaps[name](np.arange(256), bytes=True)[:, :3] for name in _COLOUR_MAPS}
     return {name: base64.b64encode(table.tobytes()).decode("ascii") for name, table in tables.items()}
 
 
 def _attributes(stack: xr.Dataset) -> list[list[str]]:
-    """Return attribute names and values, without texts of the scene, its files, objects and outlines."""
+    """Return attribute names and values, without texts for the scene, its files, objects and outlines."""
     long = {"scene_xml", "scene_dict", "scene_files", "plugin_parameters"}
     long |= {"pixel_outlines", "beam_outlines", "target_outlines"}
     return [[str(name), _readable(value)] for name, value in stack.attrs.items() if name not in long]
@@ -441,5 +441,5 @@ def _frame() -> list[str]:
 
 
 def part(name: str) -> str:
-    """Return the text of a file of the page."""
+    """Return the text in a page file."""
     return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")

@@ -24,7 +24,7 @@ def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_
     """Draw the depth of the strongest echo in every pixel, and its confidence, from `range_images.depth_image`.
 
     `dataset`: a gate stack with the coordinate ``gate_depth``. `path`: file to write. `from_depth`: leave out gates
-    whose middle is shallower on the axis [m]; by default those that open before the end of the surface echo.
+    whose middle is shallower on the axis [m]; by default gates that open before the surface echo's end.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_
 
 
 def _reach(stack: xr.Dataset) -> int | None:
-    """Return the number of gates on each side of its strongest one that an echo fills; None for an unknown pulse."""
+    """Return how many gates an echo fills on each side of its strongest one; None for an unknown pulse."""
     pulse = optional_number(stack.attrs, "pulse_fwhm_ns")
     if pulse is None:
         return None

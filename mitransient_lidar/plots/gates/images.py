@@ -1,4 +1,4 @@
-"""Figures of gate images, with animations, and of images by daylight."""
+"""Figures with gate images, with animations, and with images by daylight."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ColourScale(NamedTuple):
     extend: Literal["neither", "min", "max", "both"]  #: Ends beyond which values lie.
 
     def draw(self, ax: Axes, energy: FloatArray, stack: xr.Dataset, *, label: bool = True) -> AxesImage:
-        """Draw the energies [J] of one gate; pixels with non-finite values are grey."""
+        """Draw one gate's energies [J]; pixels with non-finite values are grey."""
         colours = matplotlib.colormaps[palette.LIGHT].with_extremes(bad="0.6")
         return drawing.draw_image(ax, energy / self.factor, stack, label=label, norm=self.norm, cmap=colours)
 
@@ -66,7 +66,7 @@ def plot_gates(dataset: xr.Dataset, path: drawing.FilePath | None = None, log: b
     For camera frames, it draws their mean above the dark level (`results.gate_stack.as_stack`).
 
     From more than 36 gates every second, third, ... one is drawn. The colours end at the brightest gate below the
-    surface (at its 99th percentile), so that the surface echo does not darken the rest; the colour bar label gives the
+    surface (at its 99th percentile), so that the surface echo does not darken the rest. The colour bar label states the
     share of brighter values. With `log` the colour scale, or the energy axis, is logarithmic.
 
     Raises
@@ -172,7 +172,7 @@ def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
 
 
 def unit_of(stack: xr.Dataset, largest: float) -> tuple[float, str]:
-    """Return factor and name of the unit for drawing values of `as_stack` up to the largest one."""
+    """Return the unit's factor and name for drawing values from `as_stack` up to the largest one."""
     if (unit := stack["gate_energy"].attrs.get("units", "J")) != "J":
         return 1.0, str(unit)
     factor, prefix = drawing.si_prefix(largest)
@@ -180,7 +180,7 @@ def unit_of(stack: xr.Dataset, largest: float) -> tuple[float, str]:
 
 
 def reached_by_surface(stack: xr.Dataset) -> BoolArray:
-    """Return which gates open before the end of the surface echo in a lit pixel; none if its time is unknown."""
+    """Return which gates open before the surface echo's end in a lit pixel; none if its time is unknown."""
     surface = optional_number(stack.attrs, "surface_time_ns")
     if surface is None:
         return np.zeros(stack.sizes["gate"], dtype=bool)
@@ -194,14 +194,14 @@ def reached_by_surface(stack: xr.Dataset) -> BoolArray:
 
 
 def known_depths(stack: xr.Dataset) -> FloatArray | None:
-    """Return the depths of the gates' middles [m], None if they are unknown."""
+    """Return the gates' middle depths [m], None if they are unknown."""
     if "gate_depth" not in stack.coords or not np.isfinite(stack["gate_depth"].values).all():
         return None
     return np.asarray(stack["gate_depth"].values, dtype=np.float64)
 
 
 def _caption(stack: xr.Dataset, index: int) -> tuple[str, str]:
-    """Return the number and the depth of a gate, and the time during which it is open."""
+    """Return a gate's number and depth, and the time during which it is open."""
     start, width = (float(stack[name].values[index]) for name in ("gate_start", "gate_width"))
     depths = known_depths(stack)
     depth = "" if depths is None else f"  {depths[index]:.2f} m"
@@ -249,7 +249,7 @@ def _columns(count: int) -> int:
 
 
 def _animated_figure(stack: xr.Dataset, *, log: bool) -> tuple[Figure, Callable[[int], None]]:
-    """Return the figure of an animation, and the function that shows a gate in it."""
+    """Return an animation's figure, and the function that shows a gate in it."""
     energy = stack["gate_energy"].values
     scale = colour_scale(stack, log=log)
     figure = drawing.new_figure(None, 8.4, 5.4)
@@ -344,12 +344,12 @@ def plot_passive(dataset: xr.Dataset, path: drawing.FilePath | None = None, fram
 
 
 def animate_passive(dataset: xr.Dataset, path: drawing.FilePath) -> None:
-    """Write the frames of an imager, from `rendering.passive.render_passive`, as an endless GIF animation in real time.
+    """Write an imager's frames, from `rendering.passive.render_passive`, as an endless GIF animation in real time.
 
     Raises
     ------
     UserError
-        If the dataset has no frames or no image, or the name of the file does not end in ``.gif``.
+        If the dataset has no frames or no image, or the file's name does not end in ``.gif``.
     """
     from PIL import Image
 

@@ -1,4 +1,4 @@
-"""All figures in the publication, and the table of its statements."""
+"""All figures in the publication, and the table with its statements."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TABLE = "statements.csv"
 
 
 class _Figure(NamedTuple):
-    """How a figure is drawn, and the quantities of the statements that it shows."""
+    """How a figure is drawn, and the quantities in the statements that it shows."""
 
     draw: Callable[[Renders], Figure]
     measure: Callable[[Renders], Mapping[str, Measured]] = lambda _renders: {}
@@ -59,7 +59,7 @@ NAMES = tuple(_FIGURES)
 
 @dataclass(frozen=True)
 class Publication:
-    """Files that were written, the statements of the figures, and whether an interruption ended the work."""
+    """Files that were written, the figures' statements, and whether an interruption ended the work."""
 
     files: tuple[Path, ...]
     statements: tuple[Statement, ...]
@@ -79,7 +79,7 @@ def figures(
     seed: Annotated[int, Option("Random seed", 0, 10**6)] = 0,
     progress: ProgressCallback | None = None,
 ) -> Publication:
-    """Make the figures for FOI's multipixel lidar model (Tulldahl 2006), and the table of its statements.
+    """Make the figures for FOI's multipixel lidar model (Tulldahl 2006), and the table with its statements.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def figures(
     Returns
     -------
     Publication
-        Paths of the files in figure order, the table last; the statements; and whether Ctrl-C ended the work: files and
+        File paths in figure order, the table last; the statements; and whether Ctrl-C ended the work. Files and
         statements then belong to the figures completed by then.
 
     Raises

@@ -51,7 +51,7 @@ def draw_waveforms(
     label: str = "",
     **style: object,
 ) -> float:
-    """Draw the mean over a series of renders against depth [m], with bands of one standard error; return its unit in W.
+    """Draw the mean over a render series against depth [m], with bands of one standard error; return its unit in W.
 
     `origin` selects the light from one origin, and `pixels` some pixels.
     """
@@ -96,7 +96,7 @@ def mine(renders: Renders) -> Figure:
 
 
 def mast(renders: Renders) -> Figure:
-    """Draw the echo of a target below a mast (figure 4)."""
+    """Draw a target's echo below a mast (figure 4)."""
     summed = renders.shot(scenes.MAST).sum("pixel", keepdims=True, keep_attrs=True)
     return _with_part(summed, (-0.5, 2.5), "4  target of 1 m² at 1 m, grazing angle 5.4°", "target alone")
 
@@ -143,12 +143,12 @@ def layer_zoom(renders: Renders) -> Figure:
 
 
 def square_target(renders: Renders) -> Figure:
-    """Draw pixels and target on the sea, and the waveforms, of 2x2 pixels (figure 13)."""
+    """Draw pixels and target on the sea, and the waveforms, for 2x2 pixels (figure 13)."""
     return _target(renders, scenes.SQUARE, "13")
 
 
 def strip_target(renders: Renders) -> Figure:
-    """Draw pixels and target on the sea, and the waveforms, of 1x4 pixels (figure 14)."""
+    """Draw pixels and target on the sea, and the waveforms, for 1x4 pixels (figure 14)."""
     return _target(renders, scenes.STRIPS, "14")
 
 
@@ -192,7 +192,7 @@ _STYLES = ("-", "--", ":")
 
 
 def surface_echoes(renders: Renders) -> Figure:
-    """Draw the places of the shots on the sea, and the surface echoes (figure 10)."""
+    """Draw the shots' places on the sea, and the surface echoes (figure 10)."""
     figure = drawing.new_figure(None, 10.4, 6.2)
     axes = figure.subplots(2, 3)
     _draw_places(renders, axes[0], "10")
@@ -258,7 +258,7 @@ _HALF_SIDE, _AXES_APART = 1.3, 0.25
 
 
 def system(_renders: Renders) -> Figure:
-    """Draw the lidar, and beam and field of view in air and in water, in the plane of incidence (figure 5)."""
+    """Draw the lidar, beam and field of view in air and in water, in the incidence plane (figure 5)."""
     numbers = System.of(FOUR)
     figure = drawing.new_figure(None, 8.0, 4.2)
     left, right = figure.subplots(1, 2)
@@ -300,7 +300,7 @@ def system(_renders: Renders) -> Figure:
 
 
 def mesh(renders: Renders) -> Figure:
-    """Draw axes refracted at facets of the sea, and its triangles with the footprints (figure 6)."""
+    """Draw axes refracted at sea facets, and the sea's triangles with the footprints (figure 6)."""
     from mitransient_lidar.transport.scene_parts import seas_of
 
     numbers, session = System.of(FOUR), renders.session(FOUR)

@@ -1,1 +1,1 @@
-"""Self-contained web page that shows a scene, or the points of a flight, in three dimensions."""
+"""Self-contained web page that shows a scene, or a flight's points, in three dimensions."""

@@ -1,4 +1,4 @@
-"""HTML page that shows a scene, or the points of a flight, in three dimensions to scale, without network.
+"""HTML page that shows a scene, or a flight's points, in three dimensions to scale, without network.
 
 ``page.html`` is the page; Plotly's script and the traces are embedded as base64 of raw deflate data.
 """
@@ -32,7 +32,7 @@ _MOST_POINTS = 80_000
 
 
 def scene_traces(geometry: SceneGeometry) -> Iterator[dict[str, Any]]:
-    """Yield the traces of a scene."""
+    """Yield a scene's traces."""
     brightest = max([0.5, *(np.nanmax(one.reflectance, initial=0.0) for one in geometry.reliefs)])
     for relief in geometry.reliefs:
         if np.isfinite(relief.z).any():
@@ -87,7 +87,7 @@ def _drawn_layers(geometry: SceneGeometry) -> FloatArray:
 
 
 def point_traces(points: xr.Dataset) -> Iterator[dict[str, Any]]:
-    """Yield the traces of the points of `flights.products.read_points`, one for each class."""
+    """Yield the traces for points from `flights.products.read_points`, one for each class."""
     drawn, origin = points.isel(point=slice(None, None, _step(points))), _origin(points)
     for kind in np.unique(drawn["kind"].values):
         own = drawn.isel(point=drawn["kind"].values == kind)
@@ -242,11 +242,11 @@ def _walls(bundle: Bundle) -> tuple[FloatArray, IntArray]:
 def page_text(
     title: str, kind: str, traces: Sequence[Mapping[str, Any]], views: Mapping[str, FloatArray], notes: Sequence[str]
 ) -> str:
-    """Return the text of a page.
+    """Return a page's text.
 
-    `title`, `kind`: name of what the page shows, and what that is. `traces`: traces of Plotly with coordinates x, y, z
-    [m]. `views`: boxes that the page can show by name, lowest and highest corner [m], shape (2, 3); it opens with the
-    first one. `notes`: sentences below the drawing.
+    `title`, `kind`: what the page shows, its name and kind. `traces`: Plotly traces with coordinates x, y, z [m].
+    `views`: boxes that the page can show by name, lowest and highest corner [m], shape (2, 3); it opens with the first
+    one. `notes`: sentences below the drawing.
     """
     import plotly.graph_objects as go
     from plotly.offline import get_plotlyjs

@@ -101,7 +101,7 @@ def plot_orders(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figu
 
 
 def plot_forecast(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw a result of `studies.forecast.forecast`: its maps, or of a range of depths the table against depth."""
+    """Draw a result of `studies.forecast.forecast`: its maps, or for a depth range the table against depth."""
     if "y" not in found.dims:
         return _plot_range(found, path)
     names = {"found": "probability that the bottom is found", "tvu": "TVU at 95 % (m)", "order": "order of S-44"}
@@ -158,7 +158,7 @@ def _forecast_title(found: xr.Dataset) -> str:
 
 
 def _draw_orders(ax: Axes, deepest: float, *, named: bool) -> None:
-    """Draw the largest vertical uncertainty of each order, with its name on the right."""
+    """Draw each order's largest vertical uncertainty, with its name on the right."""
     depth = np.linspace(0, 1.05 * deepest, 50)
     for one in SURVEY_ORDERS:
         ax.plot(depth, one.largest_tvu(depth), color="0.6", linewidth=0.9, linestyle="--")

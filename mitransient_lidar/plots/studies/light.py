@@ -34,7 +34,7 @@ def plot_scattering(found: xr.Dataset, path: drawing.FilePath | None = None) -> 
 
 
 def plot_beam_spread(spread: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the share of the light at each depth within a radius, a horizontal shift and a delay.
+    """Draw the light share at each depth within a radius, a horizontal shift and a delay.
 
     Dots are the radii that contain 50 and 90 % of the light. `spread` is a result of `studies.beam_spread.beam_spread`.
     """
@@ -61,7 +61,7 @@ def plot_beam_spread(spread: xr.Dataset, path: drawing.FilePath | None = None) -
 
 
 def _add_legend(ax: Axes, spread: xr.Dataset, styles: list[dict[str, Any]]) -> None:
-    """List the depths with the share of their light that is in the field of view."""
+    """List the depths with their light share in the field of view."""
     handles = []
     for depth, in_view, style in zip(spread["depth"].values, spread["in_view"].values, styles, strict=True):
         text = f"{100 * in_view:.3g} % in view" if np.isfinite(in_view) else "no light"

@@ -26,7 +26,8 @@ def new_panels(
     axes = figure.subplots(rows, columns, squeeze=False, **shared)
     for ax in axes.flat[count:]:
         ax.axis("off")
-    return figure, list(axes.flat[:count]), list(axes[-1]), list(axes[:, 0])
+    shown = list(axes.flat[:count])
+    return figure, shown, shown[-columns:], shown[::columns]
 
 
 def finish(
@@ -47,6 +48,7 @@ def name_sides(
     """Label the axes below and to the left of panels, and list the first one's curves on the right."""
     for ax in lowest:
         ax.set_xlabel(x)
+        ax.tick_params(labelbottom=True)
     for ax in first:
         ax.set_ylabel(y)
     handles, labels = first[0].get_legend_handles_labels()

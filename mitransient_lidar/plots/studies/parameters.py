@@ -19,8 +19,8 @@ _WIDE = 20.0  # largest over smallest ratio from which on the axis is logarithmi
 def plot_bounds(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw a result of `studies.bounds.bounds`.
 
-    For several designs, a panel per parameter ranks them by the ratio of their bound to the first, best on top, at most
-    20. For a single design, the bounds stand beside the bounds with the other parameters known, and the correlations.
+    For several designs, a panel per parameter ranks them by their bound's ratio to the first, best on top, at most 20.
+    For a single design, the bounds stand beside the bounds with the other parameters known, and the correlations.
     """
     if found.sizes["design"] == 1:
         return _plot_one(found.isel(design=0), path)
@@ -133,5 +133,5 @@ def plot_fit(fitted: xr.Dataset, path: drawing.FilePath | None = None) -> Figure
     finish(lower, zero=0, xlim=limits, xlabel=drawing.TIME_LABEL, ylabel=label)
     columns = (fitted[name].values for name in ("parameter", "value", "stderr"))
     text = ", ".join(f"{name} {value:.4g} ± {error:.2g}" for name, value, error in zip(*columns, strict=True))
-    figure.suptitle(drawing.titled(fitted.attrs, text), fontsize="medium", wrap=True)
+    figure.suptitle(drawing.titled(fitted.attrs, text), fontsize="medium")
     return drawing.save(figure, path)

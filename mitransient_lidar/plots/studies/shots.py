@@ -26,7 +26,7 @@ _FAINT = 5e-3
 
 
 def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the sea with the footprints of beam and pixels at each shot, and the shots' waveforms.
+    """Draw the sea with beam and pixel footprints at each shot, and the shots' waveforms.
 
     `rendered` is a result of `studies.shots.render_found_shots`.
     """
@@ -45,7 +45,7 @@ def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = No
 
 
 def draw_sea(ax: Axes, rendered: RenderedShots, first: int = 1) -> None:
-    """Draw elevations about the shots, and the outlines of pixels and beam at each shot on the mean sea level.
+    """Draw elevations about the shots, and pixel and beam outlines at each shot on the mean sea level.
 
     Shots are numbered from `first` on.
     """
@@ -87,7 +87,7 @@ def draw_sea(ax: Axes, rendered: RenderedShots, first: int = 1) -> None:
     ax.set_aspect("equal")
     turn = math.degrees(rendered.azimuth)
     beam = "+x" if abs(turn) < 1e-4 else f"{abs(turn):.3g}° from +x towards {'+' if turn > 0 else '-'}y"
-    ax.set_title(f"seen from above; the beam points to {beam}", fontsize="small")
+    ax.set_title(f"from above, beam along {beam}", fontsize="small")
     ax.set(xlabel="x (m)", ylabel="y (m)")
 
 
@@ -105,7 +105,7 @@ def _time_limits(results: Sequence[xr.Dataset]) -> tuple[float, float]:
 
 
 def _draw_waveforms(ax: Axes, name: str, shot: Shot, result: xr.Dataset) -> None:
-    """Draw the waveforms of a shot, with the slopes that the beam meets."""
+    """Draw a shot's waveforms, with the slopes that the beam meets."""
     power = result["waveform"].values.reshape(-1, result.sizes["time"])
     for values, style in zip(power, palette.curves(len(power)), strict=True):
         ax.plot(result["time"].values, 1e3 * values, linewidth=1.1, **style)
@@ -124,7 +124,7 @@ _LABELS = {
 
 
 def plot_shot_statistics(shots: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the strength, the times and the depths of echoes against the slopes that the beam meets.
+    """Draw echo strength, times and depths against the slopes that the beam meets.
 
     `shots` is a result of `studies.shots.shot_statistics`; a receiver without 2x2 pixels raises `UserError`.
     """

@@ -43,7 +43,7 @@ def plot_target_signal(result: xr.Dataset, path: drawing.FilePath | None = None)
 
 
 def draw_against_background(ax: Axes, result: xr.Dataset, name: str) -> None:
-    """Draw a variable [W] of every pixel as a line, and its background, the power without the target, dashed."""
+    """Draw every pixel's variable [W] as a line, and its background, the power without the target, dashed."""
     time, names = result["time"].values, [str(name) for name in result["pixel"].values]
     for i, (pixel, mark) in enumerate(zip(names, palette.marked(len(names)), strict=True)):
         ax.plot(time, 1e6 * result[name].values[i], linewidth=1.4, label=pixel, **_EVERY, **mark)
@@ -53,7 +53,7 @@ def draw_against_background(ax: Axes, result: xr.Dataset, name: str) -> None:
 
 
 def plot_target_map(maps: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the share of the echo in each pixel, and the gain in SNR, against the target's position, seen from above.
+    """Draw each pixel's echo share, and the gain in SNR, against the target's position, seen from above.
 
     `maps` is a result of `studies.target_signal.target_map`.
     """
@@ -200,7 +200,7 @@ def _draw_light(ax: Axes, found: xr.Dataset) -> None:
 
 
 def _draw_characteristic(ax: Axes, found: xr.Dataset) -> None:
-    """Draw closed forms as lines, and simulated shots at a few thresholds with the intervals of both rates."""
+    """Draw closed forms as lines, and simulated shots at a few thresholds with both rates' intervals."""
     for name, one in _combinations(found):
         ax.plot(one["false_alarm"], one["expected_detection"], color=_STYLES[name]["color"], linewidth=1.3)
         few = one.sel(false_alarm=[found.attrs["pfa"], *np.logspace(-3, -1, 5)], method="nearest")

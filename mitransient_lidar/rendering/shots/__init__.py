@@ -1,1 +1,1 @@
-"""Series of shots at several locations, rendered together."""
+"""Shot series at several locations, rendered together."""

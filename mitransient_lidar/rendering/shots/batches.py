@@ -1,4 +1,4 @@
-"""Shots of one lidar at several places, and in several poses, rendered together in batches."""
+"""One lidar's shots at several places, and in several poses, rendered together in batches."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class ShotPoses:
 
     @classmethod
     def of_receiver(cls, lidar: LidarScene, receiver: Pose) -> ShotPoses:
-        """Return the poses of a lidar's shots from the receiver's poses in the scene, arrays with the shape (shots, 3).
+        """Return a lidar's shot poses from the receiver's poses in the scene, arrays with the shape (shots, 3).
 
         The transmitter is fixed to the receiver. All axes must go down.
         """
@@ -129,7 +129,7 @@ class ShotPoses:
         """Return shapes as the shots meet them.
 
         `shapes`: the shapes. `positions`: points (x, y) among them of the shots' places [m], shape (shots, 2); None for
-        shapes that go with the lidar. `aim`: place (x, y) of the lidar in its frame [m], shape (2,).
+        shapes that go with the lidar. `aim`: the lidar's place (x, y) in its frame [m], shape (2,).
         """
         if positions is None:
             positions = np.broadcast_to(aim, (len(self), 2))
@@ -141,7 +141,7 @@ class ShotPoses:
         return ScenePart(shapes, _vectors(by), mi.Vector2f(cos, sin))
 
     def water(self, water: Water | None, place: FloatArray, aim: FloatArray) -> Water | None:
-        """Return the water of a lidar at `aim` as a shot at a place meets it, both x, y in the lidar's frame [m]."""
+        """Return a lidar's water at `aim` as a shot at a place meets it, both x, y in the lidar's frame [m]."""
         if water is None or not isinstance(water.plume, BubblePlume):
             return water
         turn = 1 + 0j if self.turns is None else complex(*self.turns[0])
@@ -176,7 +176,7 @@ def _vectors(horizontal: FloatArray, down: FloatArray | None = None) -> mi.Vecto
 
 @dataclass(frozen=True)
 class ReceivedShots:
-    """Means over the passes of shots, and their standard errors."""
+    """Means over shots' passes, and their standard errors."""
 
     #: Mean energy [J per bin], its standard error, mean power after the pulse and the receiver's response [W], and its
     #: standard error, shape (shots, pixels, bins).
@@ -194,7 +194,7 @@ class ReceivedShots:
 
     @classmethod
     def joined(cls, several: Sequence[ReceivedShots], order: IntArray | None = None) -> ReceivedShots:
-        """Return the light of all shots of several batches, in an order."""
+        """Return all shots' light from several batches, in an order."""
         if order is not None:
             several = [cls.joined(several)._in_order(order)]
         whole, parts, derivatives = (
@@ -213,7 +213,7 @@ class ReceivedShots:
 
 
 class ShotBatches:
-    """A renderer's scene, displaced to the locations of shot batches.
+    """A renderer's scene, displaced to shot batches' locations.
 
     The lidar's frame is the scene's frame, and a shot's location is its aim. The sea is refined about each location,
     and the patches lie beside each other in one mesh. Solids are met at the location itself, except solids that move
@@ -224,9 +224,9 @@ class ShotBatches:
     renderer
         Renderer for the shot at the scene's location.
     aim
-        Location (x, y) of the scene's own shot in the scene [m].
+        Location (x, y) in the scene of its own shot [m].
     passes
-        Passes of each shot, the most with a `goal`.
+        Passes for each shot, the most with a `goal`.
     share
         Share of a full pass's paths.
     goal
@@ -274,7 +274,7 @@ class ShotBatches:
         self._together = 1 if has_plume else int(np.clip(most, 1, in_turn))
 
     def at(self, shots: ShotPoses) -> Callable[[int], PassRenderer]:
-        """Return a function that returns the renderer of shots, each several times."""
+        """Return a function that returns the renderer for shots, each several times."""
         if isinstance(self._renderer, LightMapRenderer):
             return self._over_maps(self._renderer, shots)
         parts: list[tuple[mi.Scene, FloatArray | None, bool]] = []
@@ -304,7 +304,7 @@ class ShotBatches:
         return lambda copies: placed.repeated(scene_of(copies), copies)
 
     def _over_maps(self, renderer: LightMapRenderer, shots: ShotPoses) -> Callable[[int], PassRenderer]:
-        """Return as `at` a renderer of light maps, which has heights of the sea instead of a mesh."""
+        """Return as `at` a renderer by light maps, which has sea heights instead of a mesh."""
         lidar, sea = renderer.scene, self._seas[0]
         heights, corners = self._heights(sea, shots)
         places = shots.places - self._frame_origin
@@ -330,7 +330,7 @@ class ShotBatches:
         return renderer_of
 
     def _heights(self, sea: SeaPatches, shots: ShotPoses) -> tuple[FloatArray, FloatArray]:
-        """Return the heights of the sea about shots, as of `SeaPatches.heights`, once where only solids differ."""
+        """Return the sea's heights about shots, as `SeaPatches.heights` has them, once where only solids differ."""
         if shots.raised is None:
             whole: tuple[FloatArray, FloatArray] = sea.heights(shots.on_sea.places, shots.times_s)
             return whole
@@ -343,15 +343,15 @@ class ShotBatches:
     def limited(self, passes: int, seconds: float) -> ShotBatches:
         """Return the same batches with fewer passes, at least 2, and a time after which no launch may end [s].
 
-        The shots in a launch stay the same, so that a batch that the time has ended has the same bits again with its
-        number of passes. Two passes are rendered in any time.
+        The shots in a launch stay the same, so that a batch ended by time has the same bits again with its pass number.
+        Two passes are rendered in any time.
         """
         other = copy.copy(self)
         other.passes, other._seconds = passes, seconds
         return other
 
     def render(self, poses: ShotPoses, seeds: Sequence[int]) -> ReceivedShots:
-        """Render the shots of a batch, each with its own seed."""
+        """Render a batch's shots, each with its own seed."""
         shots, done, copies, lost, needed = len(poses), 0, 0, 0.0, self._together
         ends = [time.perf_counter()]
         light = Light(self._renderer.scene, self._origins > 1)
@@ -388,7 +388,7 @@ class ShotBatches:
         )
 
     def _window_of(self, several: Callable[[int], PassRenderer], shots: int) -> ErrorWindow | None:
-        """Return the bins that count in each of some shots, which may see land."""
+        """Return the bins that count in each shot, which may see land."""
         lidar = self._renderer.scene
         highest, lowest = lidar.empty_heights
         if self._window is None or highest <= lowest or lidar.submerged:
@@ -402,18 +402,18 @@ class ShotBatches:
 
     @property
     def used_values(self) -> dict[str, float]:
-        """Values used for parameters of the integrator that may be automatic."""
+        """Values used for integrator parameters that may be automatic."""
         return self._renderer.used_values
 
 
 def _errors(window: ErrorWindow | None, light: Light) -> FloatArray:
-    """Return the relative standard errors of the bins that count, none before the second pass."""
+    """Return the counted bins' relative standard errors, none before the second pass."""
     power = light.whole.power
     return np.zeros(0) if window is None or power.count < 2 else window.relative_errors(power.mean, power.stderr)
 
 
 def suits_maps(lidar: LidarScene, poses: ShotPoses) -> BoolArray:
-    """Return which shots of a scene that suits light maps serve: over water, with faint light on targets."""
+    """Return which shots in a scene that suits light maps serve: over water, with faint light on targets."""
     places = poses.places - lidar.frame_origin[:2]
     faint = [light_faintly(lidar, target, places, poses.turns) for target in lidar.targets]
     return np.asarray(np.all([over_water(lidar, places, poses.turns), *faint], axis=0))

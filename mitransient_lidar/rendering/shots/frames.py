@@ -1,4 +1,4 @@
-"""Frames of gate images, in which each gate has its own pulses, over a moving sea from a moving platform."""
+"""Gate image frames, in which each gate has its own pulses, over a moving sea from a moving platform."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def render_frames(
     sensor: Sensor = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Render frames of a scene's gates, each gate with its own pulses.
+    """Render frames with a scene's gates, each gate with its own pulses.
 
     Parameters
     ----------
@@ -91,8 +91,8 @@ def render_frames(
         As for `GateSequence`; the random order follows from `seed`.
     passes
         Passes per image, 2 to 10 000. Each renders one pulse, at its own time, drawn from its own part of the image's
-        pulses (`GateSequence.sampled_pulse`): the mean over them is unbiased. Standard errors come from the spread of
-        the passes; for images with many pulses they are at most too large, as they include the change in the sea.
+        pulses (`GateSequence.sampled_pulse`): the mean over them is unbiased. Standard errors come from the passes'
+        spread. For images with many pulses they are at most too large: they include the change in the sea.
 
     Returns
     -------
@@ -183,7 +183,7 @@ def _check_size(sequence: GateSequence, pixels: int, max_memory: float) -> None:
 
 
 class _Images:
-    """Images of a sequence, frame by frame: mean energy and standard error [J], shape (image, pixel)."""
+    """A sequence's images, frame by frame: mean energy and standard error [J], shape (image, pixel)."""
 
     def __init__(
         self, renderer: PassRenderer, sequence: GateSequence, train: GateTrain, passes: int, share: float, seed: int
@@ -232,7 +232,7 @@ class _Images:
         return False
 
     def _render(self, rows: IntArray) -> PassStatistics:
-        """Return the energies of some images [J], shape (image, pixel)."""
+        """Return some images' energies [J], shape (image, pixel)."""
         frame, gate = np.divmod(rows, self._sequence.gates)
         found, at, before = PassStatistics(), None, np.full(rows.size, np.nan)
         for number in range(self._passes):

@@ -41,18 +41,18 @@ def pilot_sea(sea: SeaSurface | None, count: int) -> tuple[FloatArray, FloatArra
 
 
 def pilots_over(loaded: ShotScene, depth: FloatArray, bottom: float, first_seed: int) -> xr.Dataset:
-    """Return the light of pilot shots over a flat bottom.
+    """Return pilot shots' light over a flat bottom.
 
     Parameters
     ----------
     loaded
         The scene, for light by maps or by merging.
     depth
-        Depths of the bottom below each shot [m], at most `bottom`, shape (PILOTS,); without effect on merged light.
+        Bottom depths below each shot [m], at most `bottom`, shape (PILOTS,); without effect on merged light.
     bottom
-        Depth of the bottom of the scene [m].
+        Depth of the scene's bottom [m].
     first_seed
-        Seed of the first shot.
+        The first shot's seed.
     """
     from mitransient_lidar.rendering.shots.batches import ShotPoses, share_for_error
     from mitransient_lidar.rendering.shots.truth import sea_of
@@ -66,7 +66,7 @@ def pilots_over(loaded: ShotScene, depth: FloatArray, bottom: float, first_seed:
 
 
 def rendered(loaded: ShotScene, batches: ShotBatches, poses: ShotPoses, first_seed: int) -> xr.Dataset:
-    """Return the light of shots, of any number, as that of a series."""
+    """Return the light for any number of shots, as a series contains it."""
     from mitransient_lidar.rendering.shots.batches import ReceivedShots
 
     numbers = first_seed + np.arange(len(poses))

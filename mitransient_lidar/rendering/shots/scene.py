@@ -1,4 +1,4 @@
-"""The loaded scene for a series of shots: lidar, time bins, batches, and labelled results."""
+"""The loaded scene for a shot series: lidar, time bins, batches, and labelled results."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ AIM, TARGET = ("aim_x", "aim_y"), ("target_x", "target_y")
 
 
 class ShotScene:
-    """The scene for a series of shots, at the first one's location; its time bins are reported, and it is checked.
+    """The scene for a shot series, at the first one's location; its time bins are reported, and it is checked.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class ShotScene:
     check
         Whether to tell the time bins, and to check the scene.
     light
-        As of `series.render_shots`.
+        As in `series.render_shots`.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class ShotScene:
         self._described = describe_scene(renderer.probe, self.window, self._renderer.focusing)
 
     def _prepare(self, axis: TimeAxis, light: str) -> PassRenderer:
-        """Return the renderer of the scene's own shot."""
+        """Return the renderer for the scene's own shot."""
         loaded = self.session.scene, self.session.sensor
         if light == "maps":
             return LightMapRenderer(find_lidar_scene(*loaded, axis=axis), PathClasses())
@@ -102,13 +102,13 @@ class ShotScene:
         return renderer
 
     def _at(self, x: float, y: float) -> dict[str, Any]:
-        """Return the parameters of a shot at a place [m]."""
+        """Return a shot's parameters at a place [m]."""
         target = self._target
         moved = {} if target is None else {"target_x": x + target[0], "target_y": y + target[1]}
         return {**(self._params or {}), "aim_x": x, "aim_y": y, **moved}
 
     def _find_companions(self) -> list[mi.Shape]:
-        """Return the shapes that move with the parameters of the target."""
+        """Return the shapes that move with the target's parameters."""
         if self._target is None:
             return []
         params = self._at(*self._place)
@@ -151,7 +151,7 @@ class ShotScene:
 
 
 def _checked_axis(axis: TimeAxis, own: TimeAxis) -> TimeAxis:
-    """Return given time bins; raise `UserError` if they leave out light of the automatic ones."""
+    """Return given time bins; raise `UserError` if they leave out light in the automatic ones."""
     margin = 0.05 * (own.end_ns - own.start_ns)
     if own.start_ns < axis.start_ns - margin or own.end_ns > axis.end_ns + margin:
         raise UserError(

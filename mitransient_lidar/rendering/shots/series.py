@@ -1,4 +1,4 @@
-"""Series of shots over one sea, with the true slope, height and depth at each place."""
+"""Shot series over one sea, with the true slope, height and depth at each place."""
 
 from __future__ import annotations
 
@@ -131,8 +131,8 @@ def render_shots(
     scene, params
         An XML scene with the parameters ``aim_x`` and ``aim_y``.
     count
-        Number of random shots, 2 to 100 000, about the origin or, if it is more than 250 m from there, the scene's aim;
-        it needs an ``ocean_surface`` with waves. Not used with `positions`.
+        Number of random shots, 2 to 100 000, about the origin or, if it is more than 250 m from there, the scene's aim.
+        They need an ``ocean_surface`` with waves. Not used with `positions`.
     positions
         Locations (x, y) where the axis meets the mean sea level [m], shape (shots, 2), -1e7 to 1e7, and at most 20 km
         apart along x and y.
@@ -141,32 +141,32 @@ def render_shots(
         ``target_y``.
     target_error
         Relative standard error, greater than 0, at most 1, that ends a batch's passes, after at least 4 of them. The
-        median over the bins of lit pixels from the surface echo to the end of the bottom echo must have reached it.
+        median over lit pixels' bins from the surface echo to the bottom echo's end must have reached it.
     max_time
         Longest time for the passes of all shots [s], greater than 0. It is shared among the batches, which end with
         fewer passes, at least two. Where these take longer, too, the result holds the batches begun by then.
     pass_share
-        Share of the paths of a full pass in each pass, 1/512 to 1; by default 1, and with a `target_error` one that
-        needs few passes. The automatic cells of passes of few paths are up to twice as wide, which changes the water's
+        Share of a full pass's paths in each pass, 1/512 to 1; by default 1, and with a `target_error` one that needs
+        few passes. The automatic cells in passes with few paths are up to twice as wide, which changes the water's
         signal by about 0.3 %.
     light
-        'merging', the integrator of the scene, or 'maps': the light of the beam is looked up in maps at several depths
+        'merging', the integrator of the scene, or 'maps': the beam's light is looked up in maps at several depths
         (`transport.light_maps.renderer`). Maps serve waves, layers of one index and a bottom, without derivatives. 2
-        passes are usual. Mean energies are within 1 % of merging, times of bottoms within 0.05 ns.
+        passes are usual. Mean energies agree with merging to within 1 %, bottom times to within 0.05 ns.
     first_seed
         Seed of the first shot, 0 to 2^40; shot n is rendered with this seed plus n.
     axis
-        Time bins instead of automatic ones, which contain the light of all shots; they must contain it, too, up to a
+        Time bins instead of automatic ones, which contain all shots' light. They must contain it, too, up to a
         twentieth of the record.
     shot_passes
-        Most passes of each shot, shape (shots,), 2 to `passes`, as in the coordinate of a series that is rendered
+        Most passes for each shot, shape (shots,), 2 to `passes`, as in the coordinate of a series that is rendered
         again.
     derivatives
         Names of parameters by which the light is differentiated, as for `rendering.render.render`.
     describe_sea
         Whether to add the attribute ``slope_deviation``, which takes 0.2 s.
     merge_unsuited
-        Whether to merge the light of a scene that maps do not suit, or with a target in the light of a shot.
+        Whether to merge light in a scene that maps do not suit, or with a target in a shot's light.
 
     Returns
     -------
@@ -313,7 +313,7 @@ def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, optio
 
 
 def describe_shots(series: xr.Dataset) -> list[str]:
-    """Return table lines for the shots of `render_shots`: locations, truth and the highest power in a pixel.
+    """Return table lines for shots from `render_shots`: locations, truth and the highest power in a pixel.
 
     The bottom is below the mean sea level, the depth below the mean surface in the beam.
     """
@@ -348,7 +348,7 @@ def _checked_passes(given: ArrayLike | None, shots: int, passes: int) -> IntArra
 def _warn_of_the_end(
     found: Sequence[ReceivedShots], done: int, planned: int, options: RenderOptions, interrupted: bool
 ) -> None:
-    """Warn of shots that are missing, or have not reached the requested error, unless Ctrl-C has ended them."""
+    """Warn about shots that are missing, or have not reached the requested error, unless Ctrl-C has ended them."""
     if done < planned and not interrupted:
         _LOG.warning("max_time = %g s ended after %d of %d shots", options.max_time, done, planned)
     if missed := sum(one.missed for one in found):

@@ -40,8 +40,8 @@ _NEAREST = 1.0
 class Shot:
     """Intersection of the beam's axis with the mean sea level.
 
-    `x` and `y` are the values of ``aim_x`` and ``aim_y`` [m]. `along` and `across` are the mean slopes over the beam's
-    footprint along the lidar's azimuth, positive for a face towards the lidar, and to its left [1].
+    `x` and `y` are the values of ``aim_x`` and ``aim_y`` [m]. `along` and `across` are mean slopes over the beam's
+    footprint [1]: along the lidar's azimuth, positive for a face towards the lidar, and to its left.
     """
 
     kind: str
@@ -66,7 +66,7 @@ class SeaMap:
 
     @classmethod
     def of_scene(cls, scene: mi.Scene) -> SeaMap:
-        """Return the map of a scene; reject one without waves."""
+        """Return a scene's map; reject one without waves."""
         from scipy.ndimage import gaussian_filter
 
         sea = sea_of(scene)
@@ -119,7 +119,7 @@ class SeaMap:
         return self._nearest("near", distance, count, apart)
 
     def _nearest(self, kind: str, distance: FloatArray, count: int, apart: float) -> list[Shot]:
-        """Return locations in the order of a slope distance, in the shape of the map."""
+        """Return locations in a slope distance's order, in the map's shape."""
         shots: list[Shot] = []
         for index in np.argsort(distance, axis=None):
             j, i = np.unravel_index(index, distance.shape)
@@ -132,7 +132,7 @@ class SeaMap:
 
 
 def transmitter_of(scene: mi.Scene) -> Transmitter:
-    """Return the transmitter of a scene; raise UserError without one."""
+    """Return a scene's transmitter; raise UserError without one."""
     transmitter = next((emitter for emitter in scene.emitters() if isinstance(emitter, Transmitter)), None)
     if transmitter is None:
         raise UserError("the scene needs a lidar_transmitter and a multipixel_receiver to find shots for")
@@ -216,7 +216,7 @@ def water_means(water: Water, depth: FloatArray) -> dict[str, FloatArray]:
 
 
 def solids_below(lidar: LidarScene, x: FloatArray, y: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the height of the highest solid at places [m], NaN without one, and whether it is a target.
+    """Return the highest solid's height at places [m], NaN without one, and whether it is a target.
 
     Places in the scene have the shape (n,); targets are `WaterScene.targets`.
     """
@@ -228,7 +228,7 @@ def solids_below(lidar: LidarScene, x: FloatArray, y: FloatArray) -> tuple[Float
 
 
 def sea_of(scene: mi.Scene) -> SeaSurface | None:
-    """Return the sea of an ``ocean_surface``, None without one."""
+    """Return an ``ocean_surface``'s sea, None without one."""
     return next((found.sea for found in seas_of(scene)), None)
 
 

@@ -212,7 +212,7 @@ def pixel_solid_angles(pixels: PixelArray) -> NDArray[np.float64]:
 
 
 def share_outside_surface(scene: DaylightScene, sampler: FovSampler) -> float:
-    """Return the share of the field of view that points down outside the surface mesh."""
+    """Return the field-of-view share that points down outside the surface mesh."""
     if not scene.surfaces:
         return 0.0
     seen = sampler.sample(dr.arange(mi.UInt32, _RAYS), _RAYS, pass_streams(0, 0, _RAYS))

@@ -1,4 +1,4 @@
-"""A scene lit by sun and sky: its parts, radiance distributions of skies, and directions of the sun."""
+"""A scene lit by sun and sky: its parts, skies' radiance distributions, and sun directions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Maps of the light of the beam on horizontal planes below the sea, of each shot; and heights of sea and bottom."""
+"""Maps for each shot with the beam's light on horizontal planes below the sea; sea and bottom heights."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STEPS = 6
 
 @dataclass(frozen=True)
 class HeightFields:
-    """Heights of the sea on square cells about the place of each shot; beyond them the sea is as at their edge."""
+    """Sea heights on square cells about each shot's place; beyond them the sea is as at their edge."""
 
     OF_SHOTS = ("low", "displacement", "turn", "start")
 
@@ -50,11 +50,11 @@ class HeightFields:
         Parameters
         ----------
         heights, corners
-            As of `physics.sea.sea_surface.SeaSurface.height_patches`, in the frame of the shapes.
+            As in `physics.sea.sea_surface.SeaSurface.height_patches`, in the shapes' frame.
         cell
             Side of a cell [m].
         wind_direction
-            Direction of the first axis of the ripples [rad].
+            Direction of the ripples' first axis [rad].
         part
             Displacement and turn of each shot.
         copies
@@ -72,7 +72,7 @@ class HeightFields:
 
     @classmethod
     def about(cls, scene: LidarScene, *, level: bool = False) -> Self:
-        """Return the field about the place of a scene's own shot, or one of a level sea there."""
+        """Return the field about the place of a scene's own shot, or a level sea's there."""
         (sea,), pose = scene.seas, scene.receiver.pose
         place = pose.in_scene(pose.ground_point())[None, :2]
         heights, corners = sea.sea.height_patches(place, sea.footprint_size, [sea.sea])
@@ -109,7 +109,7 @@ class HeightFields:
         return si
 
     def _at(self, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Vector2f]:
-        """Return height [m] and slopes of the faces at places in cells; beyond the edge those of the edge."""
+        """Return the faces' height [m] and slopes at places in cells; beyond the edge the edge's."""
         most = mi.Float(self.lines) - 2
         i, j = dr.clip(dr.floor(u), 0, most), dr.clip(dr.floor(v), 0, most)
         x, y = dr.clip(u - i, 0, 1), dr.clip(v - j, 0, 1)
@@ -167,12 +167,12 @@ class Planes:
 
 
 class LightMaps:
-    """Energy and optical length of the beam of each shot in the cells of planes.
+    """Energy and optical length for each shot's beam in the planes' cells.
 
     Cells are counted from where the transmitter's axis, refracted by a level sea, meets the plane. Energies are kept
     relative to the absorption along the receiver's axis, with and without those that scattering turns.
 
-    `scene`: scene of one or several shots. `rays`: number of rays of each beam.
+    `scene`: scene of one or several shots. `rays`: number of rays for each beam.
     """
 
     def __init__(self, scene: LidarScene, planes: Planes, shots: int, rays: int) -> None:
@@ -265,7 +265,7 @@ class LightMaps:
     def look_up(
         self, lanes: Lanes, place: mi.Point3f, depth: mi.Float, u: mi.Float, *, scattered: bool
     ) -> tuple[mi.Float, mi.Float]:
-        """Return light of the beam at places and depths [m], in one of the two planes about them.
+        """Return the beam's light at places and depths [m], in one of the two planes about them.
 
         Returns
         -------

@@ -1,8 +1,8 @@
-"""Passes that look up the light of the beam in maps, instead of following it through the water.
+"""Passes that look up the beam's light in maps, instead of following it through the water.
 
-Rays of the beam are refracted by waves and ripples and added to maps of horizontal planes. Rays of the view are
-refracted in the same way. At each depth, and where they meet the bottom, they look up the light that has come down
-there, displaced and delayed by scattering on both ways at once (`physics.water.two_way_spread`).
+Beam rays are refracted by waves and ripples and added to maps on horizontal planes. Rays of the view are refracted in
+the same way. At each depth, and where they meet the bottom, they look up the light that has come down there. It is
+displaced and delayed by scattering on both ways at once (`physics.water.two_way_spread`).
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ _NO_BED = 1e6
 
 @dataclass(frozen=True)
 class Sampling:
-    """Numbers of rays in a pass, and of what they look up."""
+    """Numbers of rays in a pass, and of their look-ups."""
 
     rays: int  #: Rays of the view.
     #: Rays of the beam, and those that look for glints, for each of them.
@@ -187,20 +187,20 @@ class LightMapRenderer(PassRenderer):
 
     @property
     def path_count(self) -> int:
-        """Number of rays of a pass from either end."""
+        """Number of rays in a pass from either end."""
         return round(self.paths * (1 + self._sampling.beam))
 
     @property
     def used_values(self) -> dict[str, float]:
-        """No values of parameters of the integrator."""
+        """No integrator parameter values."""
         return {}
 
     def over(self, scene: LidarScene, sea: HeightFields) -> LightMapRenderer:
-        """Return a renderer of shots that meet a scene in parts and heights of the sea."""
+        """Return a renderer for shots that meet a scene in parts and sea heights."""
         return changed(self, scene=scene, _sea=sea)
 
     def trace(self, received: ReceivedLight, shots: Shots, paths: int) -> None:
-        """Look up the light of one pass for each shot, with a number of rays of the view."""
+        """Look up one pass's light for each shot, with a number of view rays."""
         maps = self._maps(shots, max(round(self._sampling.beam * paths), 1))
         self._reflect(received, shots, self._sampling.glints * paths)
         seen = self._view(shots, paths)
@@ -228,7 +228,7 @@ class LightMapRenderer(PassRenderer):
         return _Rays(si.p, direction, length, dr.select(wet, weight * value[0], 0), wet)
 
     def _maps(self, shots: Shots, count: int) -> LightMaps:
-        """Return the maps of the beams, of a number of rays each."""
+        """Return the beams' maps, each with a number of rays."""
         scene, water = self.scene, self.scene.required_water
         lanes = shots.paths(count)
         moved, (x, y, *ripple) = lanes.pick(scene), _spaced(shots, lanes, _BEAM, 5)
@@ -394,8 +394,8 @@ def unsuited(scene: LidarScene) -> str | None:
 def over_water(scene: LidarScene, places: FloatArray, turns: FloatArray | None) -> BoolArray:
     """Return which shots have solids below the sea alone in their beam, shape (shots,); arguments as `light_faintly`.
 
-    Rays of the beam, its outermost among them, pass the sea without meeting a solid, down to 0.05 m or, where waves do
-    not follow the bottom, to the lowest trough.
+    Beam rays, the outermost among them, pass the sea without meeting a solid: down to 0.05 m or, where waves do not
+    follow the bottom, to the lowest trough.
     """
     wet = np.ones(len(places), dtype=bool)
     if not scene.has_dry_solids:
@@ -423,8 +423,8 @@ def over_water(scene: LidarScene, places: FloatArray, turns: FloatArray | None) 
 def light_faintly(scene: LidarScene, target: mi.Shape, places: FloatArray, turns: FloatArray | None) -> BoolArray:
     """Return which shots light a target so faintly that its shadow needs no merging, shape (shots,).
 
-    In each pixel at most `_SHADOWED` of the beam over a level sea meets the box of the target, widened as waves deflect
-    the light.
+    In each pixel at most the share `_SHADOWED` of the beam over a level sea meets the target's box, widened as waves
+    deflect the light.
 
     `scene`, `target`: the lidar's scene, and a target of it. `places`: points (x, y) of the shots among the shapes [m],
     shape (shots, 2). `turns`: cosine and sine of their rotations about the vertical, shape (shots, 2); None without

@@ -16,8 +16,8 @@ _SMALLEST_OPTICAL_DEPTH = 1e-30
 class LayeredFlight:
     """Free flights, optical depths and coefficients in a `WaterColumn`.
 
-    Optical depths are exact in every direction. Within the layer where a segment starts or ends they are the product of
-    attenuation and length (no division by the vertical component), between layers the difference between tabulated
+    Optical depths are exact in every direction. Within the layer where a segment starts or ends they are attenuation
+    times length (no division by the vertical component). Between layers they are the difference between tabulated
     vertical optical depths.
     """
 

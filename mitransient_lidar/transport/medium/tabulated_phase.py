@@ -25,8 +25,8 @@ _SHORT_STEP, _SMALL_CHANGE, _SMALL_CAP = 0.02, 0.2, 1.1e-12
 class TabulatedPhase:
     """Evaluates and samples phase functions given as power laws in s = sin^2(theta/2).
 
-    A segment is drawn by Walker's alias method (two look-ups for any table size), and s within it by the inverse of its
-    power law, so that samples are accurate in the forward peak.
+    A segment is drawn by Walker's alias method (two look-ups for any table size), and s within it by its inverse power
+    law. Samples are thus accurate in the forward peak.
 
     `tables`: phase functions, each normalised to 1 over the sphere, all with the same nodes. Lanes select theirs by
     number.

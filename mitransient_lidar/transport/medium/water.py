@@ -189,7 +189,7 @@ class Water:
         return through if self.plume is None else through + self.plume.optical_depth(point, direction, length)
 
     def scatterer_at(self, flight: LayeredFlight, point: mi.Point3f, rng: mi.PCG32) -> mi.UInt32:
-        """Draw the scatterer at the end of a flight: the layer number, or the number of layers for a bubble."""
+        """Draw the scatterer at a flight's end: the layer number, or for a bubble the number of layers."""
         layer = flight.layer_at(-point.z)
         if self.plume is None:
             return layer

@@ -139,11 +139,11 @@ class RefractedProfile:
 class WaterCells:
     """Cells that follow the sea surface and are arranged about the refracted beam, for a scene or for one pass.
 
-    Cells are sectors of rings in layers of the depth below the surface, so that the surface cuts none. The lowest one
-    above a solid ends there, and the first one behind a veil begins there. They are sheared along the beam in still
-    water, so that its light stays in one column of cells. Within a layer, light is counted on a common plane. A point's
-    look-up goes to where its light would cross this plane along the beam, refracted and spread: narrow beams do not
-    blur, however they are refracted.
+    Cells are ring sectors in layers of the depth below the surface, so that the surface cuts none. The lowest one above
+    a solid ends there, and the first one behind a veil begins there. They are sheared along the beam in still water, so
+    that its light stays in one column of cells. Within a layer, light is counted on a common plane. A point's look-up
+    goes to where its light would cross this plane along the beam, refracted and spread. Narrow beams do not blur,
+    however they are refracted.
 
     Parameters
     ----------
@@ -160,8 +160,8 @@ class WaterCells:
     bits
         Base-2 logarithm of the number of buckets per shot.
     view_growth, widening
-        Further growth with depth [1/m] of cells that a narrow view limits at the surface, as ripples widen the visible
-        light, and the largest width that it reaches relative to the surface.
+        Further growth with depth [1/m], as ripples widen the visible light, for cells that a narrow view limits at the
+        surface; and the largest width that it reaches relative to the surface.
     """
 
     OF_SHOTS = ("heights", "rings", "_shift", "_start")
@@ -227,7 +227,7 @@ class WaterCells:
         return dr.minimum(dr.fma(depth, _THICKNESS_PER_DEPTH, self._uppermost), self.thickness)
 
     def layer_at(self, depth: mi.Float) -> mi.Float:
-        """Return the number of layers, with fractions, above a depth of at least 0 [m]."""
+        """Return the number of layers, with fractions, above a depth from 0 up [m]."""
         thin = dr.fma(dr.minimum(depth, self._even), _THICKNESS_PER_DEPTH / self._uppermost, 1)
         return dr.log(thin) / _THICKNESS_PER_DEPTH + dr.maximum(depth - self._even, 0) / self.thickness
 
@@ -260,8 +260,8 @@ class WaterCells:
     def _depth_along_beam(self, point: mi.Point3f) -> tuple[mi.Float, mi.Vector2f, mi.Float]:
         """Return the depth of points below where the beam's direction leads up to the surface [m], and slopes there.
 
-        The last value is the cell volume there relative to below a level surface: 1 + s . g with the slope g and the
-        beam's horizontal displacement s per metre of depth. Newton's method, exact below a single facet.
+        The last value is the cell volume there relative to below a level surface. It is 1 + s . g with the slope g and
+        the beam's horizontal displacement s per metre of depth. Newton's method, exact below a single facet.
         """
         shear = mi.Vector2f(*self.rings.shear)
         depth = dr.maximum(self.rings.depth_at(point.z), 0)
@@ -278,8 +278,8 @@ class WaterCells:
         """Return the cells that contain points.
 
         Points of unscattered light move to their layer's plane along their lines in a `direction`, all others along the
-        beam as it is refracted there. The volume for unscattered light is corrected by the ratio of the beam profile on
-        the plane to the profile at the point, so that it represents light at the point.
+        beam as it is refracted there. The volume for unscattered light is corrected by the beam profile on the plane
+        divided by the profile at the point: it represents light at the point.
         """
         rings = self.rings
         depth, slope, stretch = self._depth_along_beam(point)

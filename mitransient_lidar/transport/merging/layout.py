@@ -131,7 +131,7 @@ class MergingLayout:
         return replace(self, cells=cells, patches=patches)
 
     def cell_sides(self, depths: FloatArray) -> FloatArray:
-        """Return the sides of the cells below a sea [m], as of `WaterCells.sides`."""
+        """Return the cells' sides below a sea [m], as in `WaterCells.sides`."""
         assert isinstance(self.cells, WaterCells)
         return self.cells.sides(depths)
 

@@ -1,4 +1,4 @@
-"""Merging of laser light with receiver paths, in cells in the water and on patches of solids, and their connection.
+"""Merging laser light with receiver paths, in water cells and on solids' patches, and their connection.
 
 Scattered light that reaches a narrow beam from far outside it rarely meets one of its cells. A connection estimates the
 same path from two points that lie far apart, joined by a straight segment in the water (vertex connection and merging:
@@ -92,9 +92,9 @@ def merge_on_solids(
 ) -> Action:
     """Return the action that merges the receiver's paths with the light on the solids that they meet.
 
-    A path with throughput beta and a photon with energy w on a patch with area A add beta w / A times the BSDF, and
-    times the ratio of the foreshortening at both points. They are weighted against `connections`, a share of all pairs,
-    that make the same path.
+    A path with throughput beta and a photon with energy w on a patch with area A add beta w / A times the BSDF. This is
+    multiplied by the foreshortening ratio between both points. They are weighted against `connections`, a share of all
+    pairs, that make the same path.
     """
 
     def merge(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:

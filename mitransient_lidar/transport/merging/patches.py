@@ -75,7 +75,7 @@ def foreshortening(light: mi.Float, projection: mi.Float) -> mi.Float:
     """Return a surface's area across light over its area across its patch's projection, from both cosines.
 
     At least 0.02: light is stored divided by this number at its own point, and merged times the number at another point
-    in the patch, so that the light on curved surfaces is right.
+    in the patch. The light on curved surfaces is then right.
     """
     return dr.maximum(light / projection, _LEAST_FORESHORTENING)
 

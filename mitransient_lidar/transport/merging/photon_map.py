@@ -53,7 +53,7 @@ class PhotonMap:
     light
         The light.
     buckets, bucket, tag
-        Number of buckets; each photon's bucket, and the tag of its cell or patch there.
+        Number of buckets; each photon's bucket, and its cell's or patch's tag there.
     further
         A further number for each.
     u

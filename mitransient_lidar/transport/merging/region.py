@@ -1,4 +1,4 @@
-"""The part of the sea that is lit or seen, and the heights of surface and solids there."""
+"""The sea's part that is lit or seen, and the surface and solid heights there."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ class _Grid:
 
 
 class SurfaceHeights:
-    """Heights of the sea surface where it is lit or seen, and of the first solids below the surface there.
+    """Sea surface heights where it is lit or seen, and heights of the first solids below the surface there.
 
     `region`: sea region. `depth`: largest depth of light [m]: solids are also found beside the region, where light at
     that depth is. `moves`: region displacements (x, y) per shot [m], shape (shots, 2).
@@ -213,7 +213,7 @@ class SurfaceHeights:
     def _look_down(
         self, scene: LidarScene, region: Region, moves: FloatArray, *, solids: bool, veils: bool = False
     ) -> _Grid:
-        """Return heights and slopes of the surface, or heights of solids under water, found with vertical rays.
+        """Return surface heights and slopes, or heights of solids under water, found with vertical rays.
 
         Solids are those that let no light pass unchanged, or the `veils`, which let a part pass.
         """

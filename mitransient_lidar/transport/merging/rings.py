@@ -73,7 +73,7 @@ class RingSector:
 class BeamRings:
     """Rings about the refracted axis of the beam, cut into sectors that are about as long as wide.
 
-    With the core radius q, rings have equal widths in arsinh(r / q): nearly equal ones in the core, and widths
+    With the core radius q, rings have equal widths in arsinh(r / q). The widths are nearly equal in the core, and
     proportional to the radius r far from it. On an obliquely lit sea rings are ellipses, as footprints are.
 
     Parameters
@@ -131,8 +131,8 @@ class BeamRings:
     ) -> BeamRings:
         """Return rings about axes that begin elsewhere: displacements of each shot [m], shape (shots, 3).
 
-        Shots whose beams have their own directions in air, `axes` in the same shape, have their own axes, below seas
-        with mean slopes `tilts`, shape (shots, 2).
+        Shots whose beams have their own directions in air, `axes` in the same shape, have their own axes. Their seas
+        have mean slopes `tilts`, shape (shots, 2).
         """
         rings = changed(self, _entry=mi.Vector3f(*_columns(entries)))
         if axes is not None and tilts is not None:
@@ -159,7 +159,7 @@ class BeamRings:
         self.tilt = _columns(tilts)
 
     def depth_at(self, z: mi.Float) -> mi.Float:
-        """Return the depth of a height [m] below the beginning of the axis [m]."""
+        """Return a height's depth [m] below the axis's beginning [m]."""
         return self._entry.z - z
 
     def core(self, depth: mi.Float) -> mi.Float:

@@ -1,4 +1,4 @@
-"""Segments of paths in the water with points at equal distances, and the store of numbers for many points."""
+"""Path segments in the water with points at equal distances, and the store of numbers for many points."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _BYTES_IN_CELL, _BYTES_PER_HIT, _BYTES_PER_SUMS = 26, 64, 16
 
 
 def memory_of_path(segments: float, points: float, perturbations: int, hits: float | None = None) -> float:
-    """Return the memory of a path with a number of segments and points [bytes]; light has `hits` on solids, too."""
+    """Return a path's memory with a number of segments and points [bytes]; light has `hits` on solids, too."""
     sums = _BYTES_PER_SUMS * -(-perturbations // 4)
     size = _BYTES_PER_PATH + segments * (_BYTES_PER_SEGMENT + sums) + points * _BYTES_PER_POINT
     return size if hits is None else size + points * (_BYTES_IN_CELL + sums) + hits * (_BYTES_PER_HIT + sums)
@@ -77,7 +77,7 @@ class SegmentBuffer:
         self._slot = mi.UInt32()
 
     def add(self, path: RandomWalkPath, length: mi.Float, active: mi.Bool) -> mi.Float:
-        """Store each path's next segment, of a length [m]; return the offset of the first point beyond it [m]."""
+        """Store each path's next segment, with a length [m]; return the offset to the first point beyond it [m]."""
         number = mi.UInt32(dr.maximum(dr.ceil((length - path.offset) * (1 / self.spacing)), 0))
         lane, throughput = path.lane, mi.Float(path.throughput)
         if self._every > 1:
@@ -174,8 +174,8 @@ class PackedStore:
     size
         Number of entries.
     fields
-        Stored fields, in the order of their packets with four numbers: by name a Mitsuba type, or the length of a list
-        of numbers. ``number|flag`` are a number, 0 or more, and a flag in its sign bit.
+        Stored fields, in the order of their packets with four numbers: by name a Mitsuba type, or a number list's
+        length. ``number|flag`` are a number, 0 or more, and a flag in its sign bit.
     """
 
     def __init__(self, size: int, fields: Mapping[str, str | int]) -> None:

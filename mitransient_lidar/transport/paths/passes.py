@@ -51,9 +51,10 @@ def check_solids(number: int) -> None:
 class PathClasses:
     """Classes into which each pixel's light is separated.
 
-    Either scattering orders below `orders`, and all higher ones together; or the light's origin: the last of the
-    `solids` that it has met, else the water if that has scattered it, else the surface. With `orders` = 0 and without
-    `solids` each pixel is one class. Labels have the number of scattering events, up to 15, if they are `counted`.
+    Either scattering orders below `orders`, and all higher ones together; or the light's origin. This is the last one
+    of the `solids` that the light has met, else the water if that has scattered it, else the surface. With `orders` = 0
+    and without `solids` each pixel is one class. Labels have the number of scattering events, up to 15, if they are
+    `counted`.
     """
 
     orders: int = 0
@@ -158,11 +159,10 @@ class ReceivedLight:
         echo: Echo | None = None,
         sums: Sums | None = None,
     ) -> None:
-        """Add the energy [J] of paths by relative optical length [m] and by the variables of their class.
+        """Add paths' energy [J] by relative optical length [m] and by their class variables.
 
-        These are the scattering order, the number of reversals, and the number of the last solid that the light has
-        met, from 1 on, or 0 (`PathClasses`). Ripples enhance an `echo` from under water. `sums` are the perturbation
-        sums of the scene.
+        These are the scattering order, the number of reversals, and the last met solid's number, from 1 on, or 0
+        (`PathClasses`). Ripples enhance an `echo` from under water. `sums` are the perturbation sums of the scene.
         """
         if self.focusing is not None and echo is not None:
             factor = self.focusing.of(echo, order, length)

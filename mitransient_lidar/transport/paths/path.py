@@ -252,8 +252,8 @@ class PathStep:
     ) -> None:
         """Continue paths from a scattering event or a surface in a new direction.
 
-        Paths end where `factor` of the throughput is 0. The sample `bs` of the surface's BSDF decides on which side of
-        the sea surface a path continues; `passes` is whether a path crosses a solid unchanged (null interface).
+        Paths end where `factor` of the throughput is 0. The sample `bs` from the surface's BSDF decides on which side
+        of the sea surface a path continues; `passes` is whether a path crosses a solid unchanged (null interface).
         """
         path.throughput *= dr.select(path.active, factor, 1)
         path.active &= path.throughput > 0

@@ -107,8 +107,8 @@ class RandomWalk:
     ) -> RandomWalkPath:
         """Walk until all paths have ended.
 
-        `on_solid` is called where a path meets a solid under water, `on_first_hit` where its first segment ends on the
-        sea or on a solid in the air. `past_solids` is whether paths continue beyond the first solid.
+        `on_solid` is called where a path meets a solid under water. `on_first_hit` is called where its first segment
+        ends on the sea or on a solid in the air. `past_solids` is whether paths continue beyond the first solid.
         """
         step, perturbations = self._step, self.scene.perturbations
 

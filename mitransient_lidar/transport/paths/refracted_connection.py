@@ -100,8 +100,8 @@ class RefractedLaserSampler(RefractedEmitterSampler):
         """Return the laser's direction from points under water.
 
         Newton's method on Snell's law for the horizontal distance between the point and the ray's crossing of z = 0. It
-        starts below the root, at the refracted straight line; there the sine of the angle in water is concave in the
-        distance, so that the steps approach the root from one side at any altitude and angle.
+        starts below the root, at the refracted straight line. There the sine of the angle in water is concave in the
+        distance: the steps approach the root from one side at any altitude and angle.
         """
         depth = dr.maximum(-point.z, _SMALLEST_DEPTH)
         height = self.laser.z
@@ -259,10 +259,10 @@ def connect_laser(scene: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Boo
     Returns
     -------
     radiance
-        Energy per area and solid angle [J/(m^2 sr)] along ``si.wi`` by the light that no shape blocks: intensity, BSDF
-        with its cosine, and inverse square distance; 0 on the other side of the sea surface.
+        Energy per area and solid angle [J/(m^2 sr)] along ``si.wi`` by the light that no shape blocks. It is intensity
+        times BSDF with its cosine times inverse square distance; 0 on the other side of the sea surface.
     length
-        Length of the line [m], relative to the distance of the scene's reference point.
+        Length of the line [m], relative to the distance to the scene's reference point.
     """
     line = StraightConnection.to_laser(scene, si.p)
     radiance = _bsdf_towards(scene, si, line.direction, active, wet=scene.submerged) * line.irradiance

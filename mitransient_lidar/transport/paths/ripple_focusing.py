@@ -87,8 +87,8 @@ class RippleFocusing:
     ) -> RippleFocusing | None:
         """Return the factors of a lidar above a sea whose spectrum is known; None for others.
 
-        `cells` returns, for depths [m], the side of the cells within which light and view are at random places, so that
-        waves of the mesh enhance their product less; None where they meet at points.
+        `cells` returns, for depths [m], the side of the cells within which light and view are at random places. Waves
+        in the mesh then enhance their product less; None where they meet at points.
         """
         seas = scene.seas
         transmitter, receiver = scene.transmitter.pose, scene.receiver.pose

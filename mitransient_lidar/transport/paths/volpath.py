@@ -345,8 +345,8 @@ class PathTracer:
     def _guiding_probability(self, vertex: Vertex, emitter: EmitterDirection) -> mi.Float | float:
         """Return the probability of the lobe towards the emitter.
 
-        Solids with a probability of their own multiply it by the share of the emitter's light that is scattered above
-        them: connections find the unscattered light.
+        Solids with their own probability multiply it by the light share from the emitter that is scattered above them:
+        connections find the unscattered light.
         """
         on_solids, water = self.options.solid_guiding_probability, self.scene.water
         if on_solids is None or water is None:
@@ -356,7 +356,7 @@ class PathTracer:
         return dr.select(vertex.scattered, mi.Float(self.options.guiding_probability), on_solids * scattered)
 
     def _by_lobe(self, vertex: Vertex, formula: Callable[[mi.Float, float], mi.Float], value: mi.Float) -> mi.Float:
-        """Return a formula of a value and the asymmetry of the lobe towards the emitter."""
+        """Return a formula's result for a value and the asymmetry of the lobe towards the emitter."""
         broad = formula(value, _GUIDING_ASYMMETRY)
         if self.options.solid_guiding_probability is None:
             return broad

@@ -93,7 +93,7 @@ def _limits(tops: FloatArray, layer: int) -> tuple[float, float]:
 
 
 def _log_derivative(layers: LayerPhases, layer: int, name: str, value: float) -> FloatArray | None:
-    """Return the derivative of ln p by a parameter at the nodes of `LayerChange`; None where it is 0."""
+    """Return ln p's derivative by a parameter at the nodes of `LayerChange`; None where it is 0."""
     scale = 1.0 if name == "phase_g" else abs(value)
     step = min(_STEP, _COSINE_SHARE * (1 - abs(value))) if name == "phase_g" else _STEP * scale
     if step == 0:
@@ -136,5 +136,5 @@ def _focusing_derivative(
 
 
 def _logarithm(table: PowerLawTable) -> FloatArray:
-    """Return the logarithm of a phase function at the nodes of `LayerChange`."""
+    """Return a phase function's logarithm at the nodes of `LayerChange`."""
     return np.asarray(np.log(table.eval_s(np.exp(DEFAULT_LOG_S0 * np.linspace(1, 0, DEFAULT_COUNT)))))

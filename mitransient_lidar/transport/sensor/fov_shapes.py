@@ -154,7 +154,7 @@ class Rectangle(FovShape):
 
 @dataclass(frozen=True)
 class Strip(FovShape):
-    """Part of a circle about the axis between two lines of constant angle_x [rad], as in the published 1x4 receiver."""
+    """Part of a circle about the axis between two constant angle_x lines [rad], as in the published 1x4 receiver."""
 
     radius: float
     angle_x_min: float

@@ -143,7 +143,7 @@ class LayoutPixels(PixelArray):
         return mi.UInt32(row * self._columns + column), dr.select(inside, mi.Float(1), 0)
 
     def centres(self) -> NDArray[np.float64]:
-        """Return centres of gravity (angle_x, angle_y) [rad], shape (pixels, 2); in imagers of the uncut cells."""
+        """Return centres of gravity (angle_x, angle_y) [rad], shape (pixels, 2); in imagers the uncut cells'."""
         height, width = self.sides
         far = 0.5 * height - (np.arange(self._rows) + 0.5) * height / self._rows
         left = 0.5 * width - (np.arange(self._columns) + 0.5) * width / self._columns

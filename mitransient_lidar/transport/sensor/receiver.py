@@ -53,7 +53,7 @@ class ReceiverOptics:
 class Receiver:
     """The attribute ``receiver`` of a sensor plugin.
 
-    Pixels are regions on the detector: light from the direction g falls on g + delta, with delta drawn from the
+    Pixels are regions on the detector. Light from the direction g falls on g + delta, with delta drawn from the
     point-spread function `blur`; sharp optics (None) have delta = 0.
     """
 
@@ -115,8 +115,8 @@ class SensorSampler:
     Around the footprint, directions are distributed in `Octaves`, as scattering spreads the light of a narrow beam.
     Both parts are weighted by the balance heuristic. Samples are stratified, and neighbours have similar directions.
 
-    With blur, directions over the view draw the point p on the detector and the direction p - delta, the others the
-    direction g and the point g + delta. Both draw delta from the point-spread function, whose density cancels.
+    With blur, directions over the view draw the detector point p and the direction p - delta; others draw the direction
+    g and the point g + delta. Both draw delta from the point-spread function, whose density cancels.
     """
 
     def __init__(self, receiver: Receiver, transmitter: mi.Emitter) -> None:
@@ -177,7 +177,7 @@ class SensorSampler:
 class Octaves:
     """Sampling of the tangent plane about a centre: even in a core, beyond it as much in each octave of distance.
 
-    The density is 1 / (pi ln(1 + R^2 / q^2) (r^2 + q^2)) at the distance r, with the core q, up to the edge R.
+    At the distance r the density is 1 / (pi ln(1 + R^2 / q^2) (r^2 + q^2)), with the core q, up to the edge R.
 
     `centre`: (angle_x, angle_y) of the centre [rad], shape (2,). `core`, `edge`: radii of the core and of all samples
     [rad], positive.
@@ -209,7 +209,7 @@ class Octaves:
 
 
 class PointSpread(ABC):
-    """Displacement on the detector of light from one direction, against the focus of sharp optics."""
+    """Light's displacement on the detector from one direction, against sharp optics' focus."""
 
     #: Angle that contains all of the light but 4e-6 [rad].
     reach: float
@@ -236,7 +236,7 @@ class GaussianPointSpread(PointSpread):
 
 
 class MeasuredPointSpread(PointSpread):
-    """Measured point-spread function, constant in each square cell of an image about the focus of sharp optics.
+    """Measured point-spread function, constant in each square image cell about the focus of sharp optics.
 
     `values`: values in any unit, not negative and not all 0, shape (rows, columns). Row 0 is the far edge (+angle_x),
     column 0 the left one (+angle_y). `width`: extent of the columns along angle_y [rad], positive.

@@ -86,3 +86,8 @@ def test_words_of_a_search_are_headings_or_terms(word: str, page: str) -> None:
 def test_pages_of_search_words_have_them_in_the_text() -> None:
     for word in ("bathymetry", "hydrography"):
         assert all(word in (ROOT / page).read_text("utf-8") for page in ("README.md", "docs/index.md")), word
+
+
+def test_every_picture_is_on_a_page() -> None:
+    text = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "README.md", *pages()))
+    assert [path.name for path in (DOCS / "images").glob("*.png") if f"images/{path.name})" not in text] == []

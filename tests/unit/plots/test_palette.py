@@ -70,11 +70,15 @@ def looks(line):
 
 
 def check_texts(figure):
-    """Texts have 7 pt where the figure is 7 inches wide; axes have units; lines of a legend are told apart."""
+    """Texts have 7 pt where the figure is 7 inches wide, and lie in it; axes have units; lines are told apart."""
     sizes = {text.get_text(): text.get_fontsize() for text in figure.findobj(Text) if text.get_text()}
     small = {text: size for text, size in sizes.items() if size < figure.get_figwidth() - 1e-6}
     assert small == {}
-    for ax in [one for parent in figure.axes for one in (parent, *parent.child_axes)]:
+    shown = [one for parent in figure.axes for one in (parent, *parent.child_axes) if one.axison]
+    for text in [*figure.texts, *(part for ax in shown for part in (ax.title, ax.xaxis.label, ax.yaxis.label))]:
+        ends, middle = text.get_window_extent().get_points(), 0.5 * figure.bbox.max
+        assert not text.get_text() or np.all(np.abs(ends - middle) < middle + 1), text.get_text()
+    for ax in shown:
         for label in (ax.get_xlabel(), ax.get_ylabel()):
             assert not label or "(" in label or label in UNITLESS, label
         named = [looks(line) for line in ax.lines if not line.get_label().startswith("_")]
