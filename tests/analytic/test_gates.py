@@ -235,5 +235,5 @@ def test_tiles_fit_the_memory_that_is_stated():
         assert len(tiles) >= fewest
         whole = range(pixels)
         assert [pixel for tile in tiles for pixel in tile or whole] == list(whole)
-    with pytest.raises(UserError, match=r"max_memory = 1 GB is less than 40 gates of 1000000 pixels take .*, 1\.1 GB"):
+    with pytest.raises(UserError, match=r"max_memory = 1 GB is less than 40 gates of 1000000 pixels take .*, 1\.18 GB"):
         accumulators._tiles(pixels, 40, 3e8, of_pass, 1.0)

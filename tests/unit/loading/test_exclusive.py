@@ -18,6 +18,7 @@ from mitransient_lidar.loading.variants import alone
 #: Functions that begin a use of Mitsuba, and classes and functions that leave it to their callers to be alone.
 BEGIN = {"open_scene", "choose_integrator", "find_lidar_scene"}
 WITHIN = {"Differences", "ShotScene", "choose_integrator", "scene_of", "axis_of"}
+WITHIN |= {"beam_spread", "fov_sweep", "scattering_orders", "target_map"}
 
 
 @alone
