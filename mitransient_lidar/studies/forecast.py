@@ -414,8 +414,8 @@ class _Bottoms:
         return series.assign_coords({name: ("shot", values) for name, values in known.items()})
 
     def _merged(self, depth: float) -> xr.Dataset:
-        """Return the light of a bottom at a depth [m], merged."""
-        return render_shots(
+        """Return the light of a bottom at a depth [m], merged; raise KeyboardInterrupt if it was interrupted."""
+        series = render_shots(
             self.scene,
             {**self.params, "bottom_depth": depth},
             positions=self._places,
@@ -424,6 +424,9 @@ class _Bottoms:
             first_seed=self.seed * 2**20,
             describe_sea=False,
         )
+        if series.attrs["interrupted"]:
+            raise KeyboardInterrupt
+        return series
 
     def _labelled(self, cells: Mapping[float, Mapping[str, Any]]) -> xr.Dataset:
         """Return a table as of `depth_bias.depth_bias`."""

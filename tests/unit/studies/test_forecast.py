@@ -142,6 +142,14 @@ def test_raised_bottoms_have_the_light_of_their_depth():
 
 
 @pytest.mark.slow
+def test_an_interrupted_render_ends_the_forecast(monkeypatch):
+    """Once, the forecast went on with the shots until then."""
+    monkeypatch.setattr(study, "render_shots", lambda *_, **__: xr.Dataset(attrs={"interrupted": 1}))
+    with pytest.raises(KeyboardInterrupt):
+        study._Bottoms("published_airborne", "table1", {"jerlov": "III"}, None, 6, 1, 3)._merged(9.0)
+
+
+@pytest.mark.slow
 def test_a_forecast_finds_shallow_bottoms_and_loses_deep_ones():
     found = forecast("riegl_vq840g", "2:25", {"jerlov": "3C", "wind_speed": 4}, shots=8, records=1)
     shares = found["table_found"].values[0]
