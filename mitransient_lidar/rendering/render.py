@@ -48,7 +48,7 @@ from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.rendering.scene_checks import check_scene, warn_of_shadows
 from mitransient_lidar.rendering.shots.frames import render_frames
 from mitransient_lidar.rendering.shots.series import render_shots
-from mitransient_lidar.results.attributes import join, split
+from mitransient_lidar.results.attributes import join, split, uninterrupted
 from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
 from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, check_solids
 from mitransient_lidar.transport.scene import LidarScene
@@ -183,7 +183,7 @@ def render(
         more: dict[str, Any] = {"sensor": sensor, "integrator": integrator, "progress": progress, **options, **others}
         (_, own), (channel, of_channel) = with_infrared(instrument, params)
         # The cheaper one first, so that its refusals come early.
-        beside = render(scene, of_channel, instrument=channel, **more)
+        beside = uninterrupted(render(scene, of_channel, instrument=channel, **more))
         return join(render(scene, own, instrument=instrument, **more), beside)
     if again.is_result(scene):
         result: Any = scene
@@ -222,7 +222,7 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     kind, chosen = again.recall(result, given := options)
     rendered = functions[kind](**chosen)
     _, infrared = split(result if isinstance(result, xarray.Dataset) else results.open(result))
-    return rendered if infrared is None else join(rendered, render_again(infrared, **given))
+    return rendered if infrared is None else join(uninterrupted(rendered), render_again(infrared, **given))
 
 
 def _render(

@@ -319,14 +319,21 @@ def _is_line(value: object) -> bool:
 #: Attribute with the JSON of the attributes of the infrared channel; group of its data in files; and part of names.
 INFRARED = "infrared"
 
-_PREFIX, _SHARED = f"{INFRARED}_", "shot"
+_PREFIX, _SHARED, _ENDED = f"{INFRARED}_", "shot", "interrupted"
+
+
+def uninterrupted(result: xr.Dataset) -> xr.Dataset:
+    """Return a result of which all is needed; raise KeyboardInterrupt if its render was interrupted."""
+    if result.attrs.get(_ENDED):
+        raise KeyboardInterrupt
+    return result
 
 
 def join(green: xr.Dataset, infrared: xr.Dataset) -> xr.Dataset:
     """Return one dataset with both channels.
 
     The infrared channel's variables and dimensions have the prefix ``infrared_``; both channels share ``shot``. From
-    two series, the shots that both have remain.
+    two series, the shots that both have remain. The attribute ``interrupted`` is 1 where one channel was interrupted.
     """
     names: dict[Hashable, str] = {name: f"{_PREFIX}{name}" for name in (*infrared.variables, *infrared.dims)}
     names.pop(_SHARED, None)
@@ -335,7 +342,8 @@ def join(green: xr.Dataset, infrared: xr.Dataset) -> xr.Dataset:
     if _SHARED in green.dims:
         count = min(green.sizes[_SHARED], own.sizes[_SHARED])
         green, own = (one.isel({_SHARED: slice(count)}) for one in (green, own))
-    return green.assign_coords(own.coords).assign(own.data_vars).assign_attrs({INFRARED: json.dumps(attributes)})
+    of_both = {INFRARED: json.dumps(attributes), **({_ENDED: 1} if infrared.attrs.get(_ENDED) else {})}
+    return green.assign_coords(own.coords).assign(own.data_vars).assign_attrs(of_both)
 
 
 def split(dataset: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset | None]:

@@ -35,6 +35,7 @@ from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.rendering.passes import MOST_PASSES, Progress, ProgressCallback
 from mitransient_lidar.rendering.render import render
+from mitransient_lidar.results.attributes import uninterrupted
 from mitransient_lidar.results.waveform_files import FILE
 
 if TYPE_CHECKING:
@@ -256,9 +257,7 @@ class _RenderedModel:
             derivatives=self.names,
             batches=min(self.passes, _MOST_BATCHES, _BATCHES + _BATCHES_PER_PARAMETER * len(self.names)),
         )
-        if dataset.attrs.get("interrupted"):
-            raise KeyboardInterrupt
-        return dataset
+        return uninterrupted(dataset)
 
     def starts(self, given: Mapping[str, float]) -> dict[str, float]:
         """Return the starts of the free parameters, by default their values in the scene."""

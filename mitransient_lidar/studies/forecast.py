@@ -50,7 +50,7 @@ from mitransient_lidar.rendering.shots.pilots import PILOTS, pilots_over, render
 from mitransient_lidar.rendering.shots.scene import ShotScene
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
-from mitransient_lidar.results.attributes import label
+from mitransient_lidar.results.attributes import label, uninterrupted
 from mitransient_lidar.results.files import Given
 from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.depth_bias import (
@@ -415,7 +415,7 @@ class _Bottoms:
 
     def _merged(self, depth: float) -> xr.Dataset:
         """Return the light of a bottom at a depth [m], merged; raise KeyboardInterrupt if it was interrupted."""
-        series = render_shots(
+        series: xr.Dataset = render_shots(
             self.scene,
             {**self.params, "bottom_depth": depth},
             positions=self._places,
@@ -424,9 +424,7 @@ class _Bottoms:
             first_seed=self.seed * 2**20,
             describe_sea=False,
         )
-        if series.attrs["interrupted"]:
-            raise KeyboardInterrupt
-        return series
+        return uninterrupted(series)
 
     def _labelled(self, cells: Mapping[float, Mapping[str, Any]]) -> xr.Dataset:
         """Return a table as of `depth_bias.depth_bias`."""

@@ -53,7 +53,7 @@ from mitransient_lidar.rendering.shots.batches import (
 )
 from mitransient_lidar.rendering.shots.scene import AIM, TARGET, ShotScene
 from mitransient_lidar.rendering.shots.truth import SeaMap, sea_of, truth_coordinates
-from mitransient_lidar.results.attributes import described, join
+from mitransient_lidar.results.attributes import described, join, uninterrupted
 from mitransient_lidar.transport.light_maps.suitability import UnsuitedError
 
 _LOG = logging.getLogger(__name__)
@@ -193,7 +193,7 @@ def render_shots(
     options_given = {**locals(), "infrared": False}
     if infrared:
         (_, own), (channel, other) = with_infrared(instrument, params)
-        green = render_shots(**options_given | {"params": own})
+        green = uninterrupted(render_shots(**options_given | {"params": own}))
         options_given |= {"params": other, "instrument": channel, "axis": None}
         options_given["positions"] = np.column_stack([green[name] for name in AIM])
         return join(green, render_shots(**options_given))

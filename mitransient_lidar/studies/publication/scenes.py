@@ -21,6 +21,7 @@ from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.series import random_places, render_shots
 from mitransient_lidar.rendering.shots.truth import SeaMap, Shot
+from mitransient_lidar.results.attributes import uninterrupted
 from mitransient_lidar.results.geometry import lidar_geometry
 from mitransient_lidar.studies.publication.statements import Series
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines
@@ -125,10 +126,9 @@ class Renders:
         if key not in self._results:
             _LOG.info("%s: %d renders", ", ".join([scene, *(f"{k}={v:g}" for k, v in params.items())]), len(places))
             options: dict[str, Any] = {"pass_share": _SHARE, "first_seed": _SEED_STEP * self.seed, **goal}
-            result = render_shots(scene, params, positions=places, progress=self.progress, **options)
-            if result.attrs["interrupted"]:
-                raise KeyboardInterrupt
-            self._results[key] = result
+            self._results[key] = uninterrupted(
+                render_shots(scene, params, positions=places, progress=self.progress, **options)
+            )
         return self._results[key]
 
 

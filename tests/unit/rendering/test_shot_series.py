@@ -12,6 +12,7 @@ from rows import each_row
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.rendering import render as single
 from mitransient_lidar.rendering.shots import batches as shot_batches
 from mitransient_lidar.rendering.shots import series as shot_series
 from mitransient_lidar.rendering.shots import truth as shot_truth
@@ -227,6 +228,23 @@ def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     series = shot_series.render_shots("fig09_2x2", FLAT, positions=PLACES)
     assert series.sizes["shot"] == series["aim_x"].size == 2
     assert series.attrs["interrupted"] == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "called"),
+    [(single, "render", "render"), (single, "render_again", "render"), (shot_series, *["render_shots"] * 2)],
+)
+def test_an_interruption_of_the_first_of_two_channels_ends_the_render(monkeypatch, module, name, called):
+    """The other channel was once rendered to its end, though there was nothing to join it to."""
+    calls = []
+    function = getattr(module, name)
+    monkeypatch.setattr(module, called, lambda *_, **__: calls.append(called) or xr.Dataset(attrs={"interrupted": 1}))
+    monkeypatch.setattr(single, "split", lambda _: (None, xr.Dataset()))
+    monkeypatch.setattr(single.again, "recall", lambda *_: ("render", {"scene": "table1"}))
+    of_scene = {"scene": "table1", "instrument": "teledyne_czmil", "infrared": True}
+    with pytest.raises(KeyboardInterrupt):
+        function(**{"result": xr.Dataset()} if name == "render_again" else of_scene)
+    assert calls == [called]
 
 
 @pytest.mark.slow
