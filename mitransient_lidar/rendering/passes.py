@@ -323,7 +323,8 @@ def run_passes(
     verify
         Called with the number of passes at 8 passes, and at the end; raises UserError if the result is useless.
     smallest
-        Number of passes that a result needs, at least 2: no goal ends the render before, and a Ctrl-C is raised.
+        Number of passes that a result needs, at least 2: no goal ends the render before, and a Ctrl-C is raised, after
+        the second pass.
     progress
         Called after every pass.
 
@@ -367,7 +368,7 @@ def run_passes(
                         needed_s=None if needed is None else pace * needed,
                     )
                     progress(state)
-                if count >= smallest:
+                if count > 1:  # one pass has no errors, and no result
                     interruption.check()
     except (KeyboardInterrupt, RuntimeError, MemoryError) as raised:
         if not is_interruption(raised):

@@ -1,6 +1,8 @@
 """The loop over passes: goals, forecasts, empty records and time limits, with passes that render nothing."""
 
+import contextlib
 import re
+import signal
 
 import numpy as np
 import pytest
@@ -105,3 +107,22 @@ def test_the_progress_line_names_the_request_and_its_forecast():
     assert str(state) == "pass 2/9, 50 % of the gates (medians over lit pixels) within 20 %, ends in 4 s"
     state = passes.Progress(done=30, planned=90, unit="run", failed=2, rate=1.234, remaining_s=48.6)
     assert str(state) == "run 30/90, 2 failed, 1.23 a second, ends in 49 s"
+
+
+@pytest.mark.parametrize(("at", "kept"), [(2, False), (4, True)])
+def test_an_interruption_waits_for_its_pass_alone(monkeypatch, at, kept):
+    """One during the passes that a result needs was once ignored until their end."""
+    clock = Clock(monkeypatch, 1.0)
+
+    def render_pass(number, seed):
+        if number == at - 1:
+            signal.raise_signal(signal.SIGINT)
+        return clock.render_pass(number, seed)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with contextlib.nullcontext() if kept else pytest.raises(KeyboardInterrupt):
+            assert run_passes(render_pass, Goal(passes=9), seed=0, smallest=3).interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert clock.passes == at
