@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from mitransient_lidar.core.errors import LINES, UserError, printable, raise_if_out_of_memory
+from mitransient_lidar.core.errors import LINES, UserError, is_interruption, printable, raise_if_out_of_memory
 from mitransient_lidar.core.interruption import TerminationAsInterrupt
 from mitransient_lidar.core.tables.written import aligned_lines, table_lines
 
@@ -80,6 +80,8 @@ def exit_on_error() -> Iterator[None]:
             try:
                 yield
             except (MemoryError, RuntimeError) as error:
+                if is_interruption(error):
+                    raise KeyboardInterrupt from error
                 raise_if_out_of_memory(error)
                 raise
         except UserError as error:

@@ -115,10 +115,13 @@ def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, descr
 
 
 def test_interruption_elsewhere_leaves_nothing_and_a_bug_is_not_taken_for_a_mistake(scene, calls, tmp_path):
-    calls.extra["error"] = KeyboardInterrupt()
-    result = run("render", scene, "-o", tmp_path / "out", "--quiet")
-    assert (result.exit_code, result.stderr) == (130, "interrupted.\n")
-    assert not (tmp_path / "out").exists()
+    wrapped = RuntimeError("while_loop(): encountered an exception")
+    wrapped.__cause__ = KeyboardInterrupt()
+    for error in (KeyboardInterrupt(), wrapped):
+        calls.extra["error"] = error
+        result = run("render", scene, "-o", tmp_path / "out", "--quiet")
+        assert (result.exit_code, result.stderr) == (130, "interrupted.\n")
+        assert not (tmp_path / "out").exists()
     calls.extra["error"] = ValueError("bug")
     assert type(run("render", scene, "-o", tmp_path).exception) is ValueError
 
