@@ -239,8 +239,9 @@ def _render(
     sensor, chosen = session.sensor, choose_integrator(session.scene, integrator)
     by_maps, is_level = options.light in ("maps", "level"), options.light == "level"
     if by_maps:
-        kind = {"image": not is_level, "level": is_level}
-        renderer: PassRenderer = LightMapRenderer(find_lidar_scene(session.scene, sensor), PathClasses(), **kind)
+        found = find_lidar_scene(session.scene, sensor)
+        is_image = not is_level or found.receiver.is_imager
+        renderer: PassRenderer = LightMapRenderer(found, PathClasses(), level=is_level, image=is_image)
     else:
         renderer = chosen.prepare(session.scene, sensor)
     if components:
