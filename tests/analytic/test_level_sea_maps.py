@@ -47,7 +47,7 @@ def test_level_sea_agrees_with_renders(params, water):
         energy, error, time = by_origin(found, origin)
         wanted, spread, arrival = by_origin(rendered, origin)
         # 32 and twelve passes, the largest of four pixels.
-        limit = largest_z(12, 4) * np.hypot(error, spread)
+        limit = significance.largest_z(12, 4) * np.hypot(error, spread)
         assert np.all(abs(energy - wanted) < limit + bias * wanted), origin
         assert np.all(abs(time - arrival) < shift + 8 * limit / wanted), origin
 
@@ -84,7 +84,8 @@ def test_series_and_derivatives_need_other_light():
 @pytest.mark.slow
 def test_images_have_rays_for_each_pixel():
     """They had the 1024 rays of a single waveform for 4096 pixels; sums agree with a level sea's merged light."""
-    params = LEVEL | {"layout": "64x64", "gate_start_ns": 1425, "gate_width_ns": 8, "gate_step_ns": 10, "gate_count": 6}
+    gates = {"gate_start_ns": 1425, "gate_width_ns": 8, "gate_step_ns": 10, "gate_count": 6}
+    params = {**LEVEL, **gates, "layout": "64x64"}
     image = mitransient_lidar.render("table1", params, light="level", passes=8)
     assert image.attrs["error_median"] < 0.2
     merged = mitransient_lidar.render("table1", params | {"layout": "1x1"}, light="merging", passes=16)
