@@ -39,6 +39,8 @@ def _campaign(
     campaign = Path(call.arguments["campaign"])
     given = {name: call.arguments[name] for name in ("workers", "scheduler")} | {"row": row, "show": show or None}
     used = [f"--{name}" for name, value in given.items() if value is not None]
+    if row is not None or show:
+        used += [call.flags[name] for name in ("light", "shard_size", "retry_failed") if call.arguments[name]]
     if len(used) > 1:
         raise UserError(f"{' and '.join(used[:2])} are alternatives: give one of them")
     if row is not None:

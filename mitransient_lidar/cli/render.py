@@ -130,8 +130,9 @@ def _shots(
     retrieve and view read. With --figure it also correlates the echoes with the sea's slopes.
     """
     scene, given = call.arguments["scene"], call.arguments
-    if given["positions"] and places is not None:
-        raise UserError("--at and --places are alternatives: give one of them")
+    ways = {"--at": given["positions"], "--places": places, "--count": given["count"]}
+    if len(used := [name for name, value in ways.items() if value]) > 1:
+        raise UserError(f"{' and '.join(used[:2])} are alternatives: give one of them")
     check_suffix("--output", output, ".nc")
     check_figure(figure, ".nc", option="--figure")
     if figure is not None and figure.with_suffix(".nc") == output:

@@ -259,6 +259,13 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     return run
 
 
+def refuse_unused(function: Callable[..., Any], reason: str, **given: Any) -> None:
+    """Raise `UserError`, with a reason, for an argument of a function that is not its default and would be ignored."""
+    for name, value in given.items():
+        if not np.array_equal(value, inspect.signature(function).parameters[name].default):
+            raise UserError(f"{name} = {shown(value)} {reason}")
+
+
 def _documented(text: str, options: Mapping[str, Option], names: Iterable[str]) -> str:
     """Return a documentation whose section of parameters has all options, and others by their `names`.
 

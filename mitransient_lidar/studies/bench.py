@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, checked, positive_option
+from mitransient_lidar.core.options import Option, checked, positive_option, refuse_unused
 from mitransient_lidar.loading.catalogue import instrument_names, scene_text
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.loading.variants import alone
@@ -170,6 +170,9 @@ def run(
         raise UserError(f"light = {light!r} needs images = True")
     if images and beams:
         raise UserError("images = True and beams = True are alternatives: give one of them")
+    if images or beams:
+        ignored = {"quick": quick, "case": case, "target_error": target_error, "max_time": max_time}
+        refuse_unused(run, f"is ignored: {'images' if images else 'beams'} = True has its own cases", **ignored)
     if images:
         layouts: Tasks = {(one,): {"layout": one, "light": light} for one in LAYOUTS}
         _run_processes("images", ("layout",), layouts, _IMAGE_COLUMNS, json)

@@ -29,6 +29,7 @@ from mitransient_lidar.core.options import (
     TargetId,
     checked,
     positive_option,
+    refuse_unused,
 )
 from mitransient_lidar.core.validation import in_range, require_memory, shown
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
@@ -168,19 +169,25 @@ def detect(
     raise it. The sum has the mean, variance and skewness of rare events (`statistics.Statistic`).
     """
     if isinstance(receiver, str) and receiver == "none":
-        if len(depths) or clutter:
-            raise UserError("receiver = 'none' measures the target's signal alone: leave out depths and clutter")
+        unused = {"pfa": pfa, "pd": pd, "depths": depths, "shots": shots, "clutter": clutter, "renders": renders}
+        unused |= {"background_power_w": background_power_w, "frames": frames}
+        if grid == 1:
+            unused["max_offset"] = max_offset
+        refuse_unused(detect, "is ignored: receiver = 'none' measures the target's signal alone", **unused)
         given: dict[str, Any] = {"target_id": target_id, "passes": passes or 64, "max_time": max_time, "seed": seed}
         given |= {"integrator": integrator, "progress": progress}
         if grid == 1:
             return target_signal(open_scene(scene, params, instrument), is_lit=True, **given)
         offsets = np.linspace(-max_offset, max_offset, grid).tolist()
         return target_map(scene, params, offsets, offsets, instrument=instrument, **given)
-    if grid > 1:
-        raise UserError(f"grid = {grid} maps the target's signal alone: it needs receiver = 'none'")
+    refuse_unused(detect, "needs receiver = 'none', which maps the target's signal", grid=grid, max_offset=max_offset)
     passes = passes or 16
     device = receiver_of("receiver", receiver)
     camera, chain = (device, None) if isinstance(device, Camera) else (None, device.default.chain)
+    if camera is None:
+        refuse_unused(detect, f"is of cameras, and receiver = {shown(receiver)} records waveforms", frames=frames)
+    else:
+        refuse_unused(detect, f"is of waveforms: receiver = {shown(receiver)} is a camera", shots=shots)
     in_range("pd", pd, 1.01 * pfa, 1 - 1e-9)
     if clutter != 0 and not 4 <= clutter <= 1000:
         raise UserError(f"clutter = {clutter} must be 0 or lie between 4 and 1000")

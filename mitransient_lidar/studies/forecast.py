@@ -38,7 +38,7 @@ from mitransient_lidar.core.maps import read_geotiff, write_geotiff
 from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.tables.written import table_lines
-from mitransient_lidar.core.validation import FloatArray, positive
+from mitransient_lidar.core.validation import FloatArray, positive, shown
 from mitransient_lidar.loading.catalogue import read_instrument
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.loading.variants import alone
@@ -110,6 +110,8 @@ class _Site:
                 first, last = positive("site", float(low)), positive("site", float(high))
             except ValueError:
                 raise UserError(f"site = {given!r} must be a map, or a range of depths such as 1:20") from None
+            if values is not None:
+                raise UserError(f"values = {shown(values)} needs a map: site = {given!r} is a range of depths")
             depths = np.linspace(min(first, last), max(first, last), _IN_RANGE)
             return cls(depths, {"depth": depths})
         terrain = read_height_map(checked_path("site", given), values=values, holes="keep")

@@ -23,6 +23,7 @@ from mitransient_lidar.core.options import (
     Seed,
     checked,
     positive_option,
+    refuse_unused,
 )
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, integer, shown
@@ -114,7 +115,11 @@ def scattering(
     named = [f"{name} = {shown(value)}" for name, value in wanted.items() if value is not None]
     if len(named) > 1:
         raise UserError(f"{' and '.join(named)} are alternatives: give one of them")
-    if fov_mrad is not None:
+    if depths is None:
+        refuse_unused(scattering, "needs depths", photons=photons)
+    if fov_mrad is None:
+        refuse_unused(scattering, "needs fov_mrad", min_depth=min_depth, max_depth=max_depth)
+    else:
         passes, params = integer("passes", passes or 48, 4, 100_000), _with_widest(scene, params, float(max(fov_mrad)))
     session = open_scene(scene, params, instrument)
     if depths is not None:

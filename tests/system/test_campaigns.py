@@ -149,6 +149,7 @@ def test_invalid_use_leaves_nothing(campaign, quick, tmp_path):
         (changed(), ["--scheduler", "nonsense://a"], "--scheduler = 'nonsense://a' cannot be reached"),
         (changed(), ["--workers", "0"], "--workers = 0 must lie between 1 and 1024"),
         (changed(), ["--workers", "2", "--row", "1"], "--workers and --row are alternatives"),
+        (changed(), ["--row", "1", "--light", "maps"], "--row and --light are alternatives"),
         (changed(), ["--row", "12", "-o", str(tmp_path / "a.nc")], "--row = 12 must lie between 0 and 11"),
     ]
     for given_campaign, options, message in cases:

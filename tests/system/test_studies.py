@@ -68,4 +68,6 @@ def test_other_scattering(scene, tmp_path, words, heads, drawn):
     assert [first for first in firsts if first in heads] == heads
     assert drawn in texts(plot)
     assert_refused(run("scattering", scene, *words, "--orders", 2), "orders = 2 and ", "are alternatives")
+    other = "--min-depth" if "--depths" in words else "--photons"
+    assert_refused(run("scattering", scene, *words, other, 2000), f"{other} = 2000", " needs ")
     assert_refused(run("scattering", scene, "--fov-mrad", 20, "--passes", 3), "passes = 3 must")

@@ -98,8 +98,9 @@ def surface_slopes(
     lidar = lidar_geometry(dataset.attrs)
     if "pixel" not in dataset.dims or dataset.sizes["pixel"] < 2:
         raise UserError("surface slopes need waveforms of at least 2 pixels over the dimension pixel")
-    if slope_deviation is not None and wind_speed is not None:
-        raise UserError(f"slope_deviation = {slope_deviation} and wind_speed = {wind_speed:g} are alternatives")
+    for name, value in {"wind_speed": wind_speed, "wind_direction_deg": wind_direction_deg}.items():
+        if slope_deviation is not None and value is not None:
+            raise UserError(f"slope_deviation = {slope_deviation} and {name} = {value:g} are alternatives")
     echoes = echo_table.extract(dataset).transpose(..., "pixel")
     surface = echoes.sel(echo="surface")
     shape = surface["time_ns"].shape[:-1]

@@ -112,6 +112,7 @@ def test_sentences_of_the_extremes(site, options, sentence, tables):
     [
         ("no:3", {}, "site = 'no:3' must be a map, or a range of depths such as 1:20"),
         ("0.1:0.3", {}, "must be deeper than 0.5 m somewhere, but is 0.3 m deep"),
+        ("1:3", {"kd": 0.1, "values": "depths"}, "values = 'depths' needs a map: site = '1:3' is a range of depths"),
         ("1:3", {"kd": 0.1, "secchi": 5}, "secchi = 5 and kd = 0.1 are alternatives: give one of them"),
         ("1:3", {"kd": "map.tif"}, "must be a number, unless the site is a map"),
         ("1:3", {"params": {"bottom_depth": 2}}, "parameter bottom_depth follows from the site: leave it out"),

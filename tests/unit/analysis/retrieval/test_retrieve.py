@@ -292,9 +292,12 @@ def drop(name):
         (lambda: retrieve.surface_slopes(drop("altitude")), "the dataset has no attribute altitude"),
         (lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=0.1), r"wind_speed = 0\.1 must lie between 1 and 30"),
         (lambda: retrieve.surface_slopes(result(), wind_speed=6), "wind_speed = 6 needs a result of a round Gaussian"),
-        (
-            lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=6, slope_deviation=(0.1, 0.1)),
-            "slope_deviation = .* and wind_speed = 6 are alternatives",
+        *(
+            (
+                lambda name=name: retrieve.surface_slopes(of_a_sea(), slope_deviation=(0.1, 0.1), **{name: 6}),
+                f"slope_deviation = .* and {name} = 6 are alternatives",
+            )
+            for name in ("wind_speed", "wind_direction_deg")
         ),
         (lambda: retrieve.bottom(result().drop_vars("waveform"), LEVEL), "the dataset has no waveform"),
         (lambda: retrieve.bottom(result(obscuration=2.0), LEVEL), "obscuration = 2.0: it must be a number between 0"),
