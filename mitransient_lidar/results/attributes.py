@@ -342,6 +342,7 @@ def join(green: xr.Dataset, infrared: xr.Dataset) -> xr.Dataset:
     if _SHARED in green.dims:
         count = min(green.sizes[_SHARED], own.sizes[_SHARED])
         green, own = (one.isel({_SHARED: slice(count)}) for one in (green, own))
+        green, attributes = green.assign_attrs(shots=count), {**attributes, "shots": count}
     of_both = {INFRARED: json.dumps(attributes), **({_ENDED: 1} if infrared.attrs.get(_ENDED) else {})}
     return green.assign_coords(own.coords).assign(own.data_vars).assign_attrs(of_both)
 

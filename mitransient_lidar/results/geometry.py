@@ -230,12 +230,14 @@ def pulse_of(attributes: Attributes) -> Pulse:
 def optional_number(attributes: Attributes, name: str) -> float | None:
     """Return an attribute that is a finite number, or None."""
     value = attributes.get(name)
-    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else None
+    return float(value) if isinstance(value, (int, float, np.number)) and math.isfinite(value) else None
 
 
-def required_number(attributes: Attributes, name: str) -> float:
-    """Return an attribute that is a number of at least 0; raise `UserError` otherwise."""
+def required_number(attributes: Attributes, name: str, usual: float | None = None) -> float:
+    """Return an attribute that is a number of at least 0, or the usual one; raise `UserError` otherwise."""
     if name not in attributes:
+        if usual is not None:
+            return usual
         raise UserError(f"the dataset has no attribute {name}")
     number = optional_number(attributes, name)
     if number is None or number < 0:

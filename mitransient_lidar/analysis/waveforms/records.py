@@ -117,7 +117,7 @@ class Waveforms:
         geometry = lidar_geometry(dataset.attrs)
         shape = pulse or pulse_of(dataset.attrs)
         step = results.time_axis(dataset).bin_width_ns
-        response = float(dataset.attrs.get("response_time_ns", 0.0))
+        response = required_number(dataset.attrs, "response_time_ns", 0.0)
         receiver = _receiver_response(dataset, step) if name == "signal" else None
         template = Template.of(shape, step if receiver is None else receiver.bin_ns, response, receiver)
         kernel = shape.kernel(step, response) if receiver is None else template.kernel(step)
@@ -126,10 +126,10 @@ class Waveforms:
         given = None if echo_fwhm_ns is None else positive("echo_fwhm_ns", echo_fwhm_ns)
         width = given or _echo_width(dataset, template, ns_per_mrad)
         echo_shape = EchoShape.of(template)
-        wavelength = float(dataset.attrs.get("wavelength_nm", 532.0))
+        wavelength = required_number(dataset.attrs, "wavelength_nm", 532.0)
         fading = Fading.of(wavelength, geometry.metres_per_ns, template.fwhm_ns)
         focusing = None if fading.opaque else Focusing.from_attributes(dataset.attrs)
-        half_view = 0.5 * float(dataset.attrs.get("field_of_view_mrad", 0.0))
+        half_view = 0.5 * required_number(dataset.attrs, "field_of_view_mrad", 0.0)
         quiet_until = geometry.surface_time_ns - 2 * width - ns_per_mrad * half_view
         # Crests are earlier than the mean sea level.
         heights = np.atleast_1d(dataset.attrs.get("surface_heights_m", 0.0))
@@ -361,8 +361,8 @@ def _expanded(dataset: xr.Dataset, logarithm: LogAmplifier) -> xr.Dataset:
 
 def _echo_width(dataset: xr.Dataset, template: Template, ns_per_mrad: float) -> float:
     """Return a level sea's echo width [ns] over the footprint of beam or field of view."""
-    sigma = 0.5 * float(dataset.attrs.get("divergence_mrad", 0.0))
-    if field := float(dataset.attrs.get("field_of_view_mrad", 0.0)):
+    sigma = 0.5 * required_number(dataset.attrs, "divergence_mrad", 0.0)
+    if field := required_number(dataset.attrs, "field_of_view_mrad", 0.0):
         sigma = min(sigma, 0.25 * field)
     spread = math.sqrt(8 * math.log(2)) * sigma * ns_per_mrad
     return min(math.hypot(template.fwhm_ns, spread), _LONGEST_ECHO * template.fwhm_ns)

@@ -13,7 +13,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
-from mitransient_lidar.results.geometry import LinesOfSight
+from mitransient_lidar.results.geometry import LinesOfSight, required_number
 
 #: Least share of the beam in a pixel with direct light, relative to the brightest pixel.
 LEAST_SHARE = 1e-3
@@ -131,7 +131,7 @@ def infrared_level(
     away = lines.surface_time * half
     x, y = away * lines.sight_x / np.cos(lines.off_nadir), away * lines.sight_y
     apart = _aim(green) - _aim(infrared)
-    width = 2e-3 * float(green.attrs.get("divergence_mrad", 0.0)) * float(np.mean(away))
+    width = 2e-3 * required_number(green.attrs, "divergence_mrad", 0.0) * float(np.mean(away))
     slope = mean_slope(green.attrs, width)
     by_waves = slope * np.hypot(np.hypot(x + apart[0], y + apart[1]), 0.25 * width)
     timing = np.hypot(*(np.hypot(*timing_jitter(one.attrs)) for one in (green, infrared)))

@@ -38,8 +38,11 @@ def test_both_channels_are_what_they_were(tmp_path):
 
 
 def test_series_share_their_shots():
-    series = [xr.concat([result(9, nm)] * count, "shot") for nm, count in ((532.0, 4), (1064.0, 3))]
+    """An interrupted infrared series once kept the number of green shots, and was not rendered again."""
+    many = ((532.0, 4), (1064.0, 3))
+    series = [xr.concat([result(9, nm)] * count, "shot").assign_attrs(shots=count) for nm, count in many]
     both = join(*series)
+    assert [one.attrs["shots"] for one in (*split(both), *series)] == [3, 3, 4, 3]
     assert both["waveform"].sizes["shot"] == both["infrared_waveform"].sizes["shot"] == 3
     assert split(both)[1]["waveform"].dims == series[1]["waveform"].dims
 

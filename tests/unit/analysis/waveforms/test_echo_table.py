@@ -227,6 +227,10 @@ def drop(name):
         (result().drop_vars("waveform"), {}, "must have waveforms over time or signals of a receiver"),
         (drop("altitude"), {}, "the dataset has no attribute altitude"),
         (drop("pulse_fwhm_ns"), {}, "the dataset has no attribute pulse_fwhm_ns"),
+        *(
+            (result(**{name: np.nan}), {}, f"the attribute {name} = nan of the dataset must be a number")
+            for name in ("divergence_mrad", "field_of_view_mrad", "response_time_ns", "wavelength_nm")
+        ),
         (result(np.full((1, BINS), np.nan)), {}, "waveform holds values that are not finite"),
         (result(), {"estimators": "best"}, "estimator 'best' must be one of"),
         (result(), {"estimators": []}, "estimator '' must be one of"),
