@@ -34,8 +34,7 @@ class PassIntegrator(mi.CppADIntegrator):
     ``mitransient_lidar.render`` prepares a scene once for all passes.
     """
 
-    #: Integrator name in results.
-    plugin: str
+    plugin: str  #: Integrator name in results.
 
     #: Whether it renders daylight instead of lidar echoes.
     passive = False

@@ -82,8 +82,7 @@ class FournierForand(TabulatedPhaseFunction):
 
 logger = logging.getLogger(__name__)
 
-#: Largest relative normalisation error without a warning.
-_TOLERATED = 0.02
+_TOLERATED = 0.02  #: Largest relative normalisation error without a warning.
 
 
 @register("phase", MEASURED_PHASE)

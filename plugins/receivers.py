@@ -157,8 +157,7 @@ class MultipixelReceiver(ReceiverSensor):
         super().__init__(props, _nested_pixels(props, nested) if nested else _own_pixels(props))
 
 
-#: Lens parameters.
-_LENS = ("focal_length_mm", "pixel_pitch_um")
+_LENS = ("focal_length_mm", "pixel_pitch_um")  #: Lens parameters.
 
 
 def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:

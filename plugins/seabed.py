@@ -23,20 +23,14 @@ logger = logging.getLogger(__name__)
 #: Steepest ripples, height over length, so that facets are at most at 45 degrees, as with the steepest tilt.
 _STEEPEST_RIPPLE = 0.3
 
-#: Largest number of cells per side of the fine square: 8 million triangles.
-_MOST_CELLS = 2048
+_MOST_CELLS = 2048  #: Largest number of cells per side of the fine square: 8 million triangles.
 
 #: Longest default cell [m], and cells per ripple length and per patch radius.
 _LARGEST_CELL, _CELLS_PER_RIPPLE, _CELLS_PER_RADIUS = 0.25, 8.0, 8.0
 
-#: Fewest cells that resolve a ripple.
-_FEWEST_CELLS_PER_RIPPLE = 4.0
-
-#: Side of the fine square without height map and patches [m].
-_DEFAULT_SIZE = 20.0
-
-#: Mesh attribute: reflectance.
-REFLECTANCE = "vertex_reflectance"
+_FEWEST_CELLS_PER_RIPPLE = 4.0  #: Fewest cells that resolve a ripple.
+_DEFAULT_SIZE = 20.0  #: Side of the fine square without height map and patches [m].
+REFLECTANCE = "vertex_reflectance"  #: Mesh attribute: reflectance.
 
 
 @dataclass(frozen=True)

@@ -25,17 +25,10 @@ from mitransient_lidar.rendering.passes import SMALLEST_SHARE
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.attributes import described
 
-#: Half the side of the square that contains a sea's locations [m].
-_REACH = 256.0
-
-#: Relative margin of a shared record on both sides.
-_MARGIN = 0.05
-
-#: Number of the random sea; each run has its own unless the campaign gives it.
-_SEA = "surface_seed"
-
-#: Whole numbers for random seas.
-_SEAS = 2**31 - 1
+_REACH = 256.0  #: Half the side of the square that contains a sea's locations [m].
+_MARGIN = 0.05  #: Relative margin of a shared record on both sides.
+_SEA = "surface_seed"  #: Number of the random sea; each run has its own unless the campaign gives it.
+_SEAS = 2**31 - 1  #: Whole numbers for random seas.
 
 
 class Array(NamedTuple):

@@ -39,23 +39,18 @@ from mitransient_lidar.core.files import open_log
 
 _LOG = logging.getLogger(__name__)
 
-#: Time between two writes of a shard that is not finished [s].
-_INTERVAL_S = 60.0
+_INTERVAL_S = 60.0  #: Time between two writes of a shard that is not finished [s].
 
 #: Number of times that the process may end while it renders a run before this run has failed, or before its first run.
 _MOST_DEATHS, _MOST_STARTS = 2, 3
 
-#: Number of runs with a program error, or that hang, after which the rest of a shard is left.
-_MOST_BUGS = 3
-
-#: Longest program error reason; the log contains the traceback.
-_LONGEST_REASON = 200
+_MOST_BUGS = 3  #: Number of runs with a program error, or that hang, after which the rest of a shard is left.
+_LONGEST_REASON = 200  #: Longest program error reason; the log contains the traceback.
 
 #: Environment variables with thread numbers for numerical libraries.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
-#: Time for a process to write the runs that it has when the campaign ends [s].
-_WRITE_S = 10.0
+_WRITE_S = 10.0  #: Time for a process to write the runs that it has when the campaign ends [s].
 
 #: Time between two checks of a process [s], and number of checks without any processor time after which it hangs;
 #: checks while it waits for a disk, which may be a server's, do not count.

@@ -38,20 +38,14 @@ from mitransient_lidar.results.attributes import described
 
 _LOG = logging.getLogger(__name__)
 
-#: Values of the variable ``status``.
-PLANNED, DONE, FAILED = 0, 1, 2
+PLANNED, DONE, FAILED = 0, 1, 2  #: Values of the variable ``status``.
 
 #: Fewest and most runs per shard, and number of shards in a campaign if its runs allow.
 _FEWEST, _MOST, _SHARDS = 8, 1024, 16
 
-#: Largest size of a shard in memory [bytes], by default.
-LARGEST_BYTES = 2**29
-
-#: Memory per byte of a shard: itself, and its chunk while that is written.
-BYTES_PER_BYTE = 2
-
-#: Most runs in a requested shard, and in a chunk of an array for all runs.
-LARGEST_SHARD = 10**6
+LARGEST_BYTES = 2**29  #: Largest size of a shard in memory [bytes], by default.
+BYTES_PER_BYTE = 2  #: Memory per byte of a shard: itself, and its chunk while that is written.
+LARGEST_SHARD = 10**6  #: Most runs in a requested shard, and in a chunk of an array for all runs.
 
 _INPUT = "_input"  # suffix of scene parameters with the name of a variable
 

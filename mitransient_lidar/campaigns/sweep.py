@@ -35,14 +35,9 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-#: Shards for each worker that are with the scheduler at a time.
-_AHEAD = 4
-
-#: Shards with runs that could not be rendered after which the campaign ends.
-_MOST_LEFT = 8
-
-#: Runs that are tried until one shows a store's arrays.
-_TRIALS = 8
+_AHEAD = 4  #: Shards for each worker that are with the scheduler at a time.
+_MOST_LEFT = 8  #: Shards with runs that could not be rendered after which the campaign ends.
+_TRIALS = 8  #: Runs that are tried until one shows a store's arrays.
 
 
 #: Options for campaigns and flights.

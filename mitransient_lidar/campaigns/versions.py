@@ -18,11 +18,8 @@ _LOG = logging.getLogger(__name__)
 #: Packages whose version decides the numbers. LLVM does not: 22.1 and 23.1 give the same bits.
 _PACKAGES = ("mitsuba", "drjit", "numpy")
 
-#: Files of the package that decide the numbers, by suffix.
-_SUFFIXES = (".py", ".csv", ".toml")
-
-#: Name of the SHA-256 of the files.
-FILES = "files of mitransient-lidar"
+_SUFFIXES = (".py", ".csv", ".toml")  #: Files of the package that decide the numbers, by suffix.
+FILES = "files of mitransient-lidar"  #: Name of the SHA-256 of the files.
 
 
 def own_versions() -> dict[str, str]:

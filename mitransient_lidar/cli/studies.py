@@ -17,8 +17,7 @@ COMMANDS = Commands()
 
 Figure = Annotated[Path, Option("PNG, PDF or SVG file; also writes the data as .nc")]
 
-#: Headings of the help.
-_DESIGN, _SURVEY = "Targets, designs and scattering", "Depths and their uncertainty"
+_DESIGN, _SURVEY = "Targets, designs and scattering", "Depths and their uncertainty"  #: Headings of the help.
 
 
 def _study(

@@ -44,8 +44,7 @@ from mitransient_lidar.core.validation import (
     shown,
 )
 
-#: Shortest time between two states that are shown [s].
-_INTERVAL_S = 0.2
+_INTERVAL_S = 0.2  #: Shortest time between two states that are shown [s].
 
 #: Whether a public function runs: of one that calls others, the notebook shows the whole alone.
 _running: ContextVar[bool] = ContextVar("running", default=False)

@@ -136,8 +136,7 @@ def _restored(value: Mapping[str, Any]) -> Any:
     return bitmap
 
 
-#: Origin of the scene's own frame.
-_ORIGIN = np.zeros(3)
+_ORIGIN = np.zeros(3)  #: Origin of the scene's own frame.
 
 #: Largest array of a Mitsuba object whose values are stored; others, such as vertices, are in the files.
 _MOST_VALUES = 16

@@ -30,8 +30,7 @@ _LOG = logging.getLogger(__name__)
 #: Variants that the plugins support, in the order of preference.
 SUPPORTED_VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
 
-#: Dr.Jit 1.5 aborts the process with LLVM 15 and 16, and rejects older releases.
-OLDEST_USABLE_LLVM = 17
+OLDEST_USABLE_LLVM = 17  #: Dr.Jit 1.5 aborts the process with LLVM 15 and 16, and rejects older releases.
 
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _LLVM_WHEEL = "karellen-llvm-core"
@@ -306,8 +305,7 @@ def describe() -> dict[str, str]:
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
-#: Time after which a thread that waits looks for an interruption [s].
-_LOOK_S = 0.1
+_LOOK_S = 0.1  #: Time after which a thread that waits looks for an interruption [s].
 
 
 class _Turn:

@@ -34,8 +34,7 @@ TIME_LABEL = "time since the pulse left the transmitter (ns)"
 _RECORD_TIME = "time since the start of each waveform (ns)"
 ANGLE_X_LABEL, ANGLE_Y_LABEL = "away from nadir, angle_x (mrad)", "to the left, angle_y (mrad)"
 
-#: Most pixels that a legend lists by name.
-LISTED_PIXELS = 12
+LISTED_PIXELS = 12  #: Most pixels that a legend lists by name.
 
 _FORMATS = (".png", ".pdf", ".svg")
 _DPI = 160

@@ -24,20 +24,14 @@ from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.results.geometry import optional_number, pose_of
 
-#: Most cells along a side of an imager that are drawn with edges.
-_EDGED_CELLS = 16
-
-#: Largest ratio between length and width of a footprint that is drawn to scale.
-_LARGEST_ASPECT = 4.0
-
-#: Most planes through targets, and planes side by side.
-_MOST_TARGET_PLANES, _MOST_COLUMNS = 3, 3
+_EDGED_CELLS = 16  #: Most cells along a side of an imager that are drawn with edges.
+_LARGEST_ASPECT = 4.0  #: Largest ratio between length and width of a footprint that is drawn to scale.
+_MOST_TARGET_PLANES, _MOST_COLUMNS = 3, 3  #: Most planes through targets, and planes side by side.
 
 #: Heights of targets that differ by less are drawn on one plane [m], and axes that differ by less as one [m].
 _SAME_PLANE, _SAME_POINT = 0.05, 1e-3
 
-#: Longest list of target names in a title.
-_LONGEST_NAME = 32
+_LONGEST_NAME = 32  #: Longest list of target names in a title.
 
 _SHADOW_COLOUR = "#00000055"
 _LEVELS = {0.6065: "e$^{-1/2}$", 0.1353: "e$^{-2}$", 1.0: "rim"}

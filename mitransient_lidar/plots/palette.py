@@ -24,8 +24,7 @@ CATEGORIES = RED, GREEN, BLUE, BLACK, ORANGE, SKY, PURPLE = (
 #: Lines of reference, limits and truth.
 GREY = "#777777"
 
-#: Parts of a scene.
-BEAM, VIEW, SEA, BOTTOM, TARGET, LAYER = ORANGE, BLACK, SKY, RED, PURPLE, GREY
+BEAM, VIEW, SEA, BOTTOM, TARGET, LAYER = ORANGE, BLACK, SKY, RED, PURPLE, GREY  #: Parts of a scene.
 
 #: Components of the received light.
 ORIGINS = {"surface": SKY, "water": BLUE, "bottom": BOTTOM, "target": TARGET}

@@ -19,20 +19,14 @@ from mitransient_lidar.results.attributes import PointClass
 #: Classes of solid points.
 _SOLID = (PointClass.GROUND, PointClass.UNCLASSIFIED, PointClass.BOTTOM, PointClass.OBJECT)
 
-#: Half the width of a profile's strip [m], and most waveforms in it.
-_STRIP, _MOST_WAVEFORMS = 1.5, 2000
+_STRIP, _MOST_WAVEFORMS = 1.5, 2000  #: Half the width of a profile's strip [m], and most waveforms in it.
 
 #: Heights in a profile above sea and land and below the deepest point [m], and most cell columns in its picture.
 _ABOVE, _BELOW, _COLUMNS = 1.0, 1.5, 200
 
-#: Most points of a class that are drawn large.
-_RARE = 50
-
-#: Range of a nanosecond between pulse and echo in the air [m].
-_PER_NS = 0.5e-9 * C0
-
-#: Orders of magnitude of the signals in a profile.
-_DECADES = 3.0
+_RARE = 50  #: Most points of a class that are drawn large.
+_PER_NS = 0.5e-9 * C0  #: Range of a nanosecond between pulse and echo in the air [m].
+_DECADES = 3.0  #: Orders of magnitude of the signals in a profile.
 
 
 def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:

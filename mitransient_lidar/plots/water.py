@@ -24,8 +24,7 @@ _SMALLEST_DEG = 0.01
 #: Most phase functions drawn for a profile, and the smallest visible step of ln(bb/b) between them.
 _MOST_FUNCTIONS, _RATIO_STEP = 8, 0.02
 
-#: Most decades on the axis of the coefficients, which may fall to 0.
-_DECADES = 5
+_DECADES = 5  #: Most decades on the axis of the coefficients, which may fall to 0.
 
 
 def plot_water(

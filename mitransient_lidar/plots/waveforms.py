@@ -253,11 +253,8 @@ def _title(dataset: xr.Dataset, shown: str = "mean and 90 %") -> str:
     return "  ·  ".join(parts)
 
 
-#: Panel height [inch], and largest number of panels.
-_PANEL, _MOST = 1.5, 12
-
-#: Share of the largest power below which relative changes are not drawn.
-_SMALLEST = 1e-3
+_PANEL, _MOST = 1.5, 12  #: Panel height [inch], and largest number of panels.
+_SMALLEST = 1e-3  #: Share of the largest power below which relative changes are not drawn.
 
 
 def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
@@ -310,8 +307,7 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
 #: Pixels above which their sum is drawn: a curve of each would take minutes, and hide the others.
 _MOST_CURVES = 64
 
-#: Bins from one marker on a curve to the next one.
-_MARK_EVERY = 12
+_MARK_EVERY = 12  #: Bins from one marker on a curve to the next one.
 
 
 def plot_comparison(

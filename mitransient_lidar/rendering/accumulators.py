@@ -42,19 +42,14 @@ _BYTES_PER_PASSING_BIN, _BYTES_PER_KEPT_GATE, _BYTES_PER_DIRECT_GATE, _BYTES_PER
 #: Memory of the program, and its means and errors per pixel, and per gate that is summed directly, in all passes and
 #: when it is written, for images.
 _PROGRAM, _BYTES_PER_PIXEL, _BYTES_OF_MEANS, _BYTES_PER_WRITTEN_GATE = 0.31e9, 260.0, 16, 6
-#: Most tiles of an image.
-_MOST_TILES = 64
-#: Memory per bin in a batch of passes: its sum, and the mean in the result.
-_BYTES_PER_BATCH = 16
-
-#: Pixels from which the error of a gate is estimated.
-_ERROR_PIXELS = 4096
+_MOST_TILES = 64  #: Most tiles of an image.
+_BYTES_PER_BATCH = 16  #: Memory per bin in a batch of passes: its sum, and the mean in the result.
+_ERROR_PIXELS = 4096  #: Pixels from which the error of a gate is estimated.
 
 #: Smallest path share in a pass with smoothed images: with fewer, paths take little of the time.
 _LEAST_SHARE_OF_SMOOTH = 2**-3
 
-#: Values that are summed at a time.
-_SUMMED = 2**23
+_SUMMED = 2**23  #: Values that are summed at a time.
 
 #: A pixel is lit in a gate with this share of the energy in the gate's brightest pixels (99th percentile).
 _LIT = 0.05

@@ -16,14 +16,12 @@ from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Pixels darker than this fraction of the median are excluded from the radiance errors.
-_DARK_PIXEL = 1e-2
+_DARK_PIXEL = 1e-2  #: Pixels darker than this fraction of the median are excluded from the radiance errors.
 
 #: Noise in the estimated bias of smoothing over the smoothed image's noise, squared, where pixels share no noise.
 _NOISE_OF_BIAS = 1 / 6
 
-#: Values of an array that are added at a time.
-_PART = 2**17
+_PART = 2**17  #: Values of an array that are added at a time.
 
 #: Most bin blocks, and about as many pixels, over which error correlation is measured.
 _BLOCKS, _CORRELATED_PIXELS = 512, 1024

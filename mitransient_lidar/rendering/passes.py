@@ -15,14 +15,9 @@ from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.options import Option, declared, positive_option
 from mitransient_lidar.core.validation import FloatArray
 
-#: Largest number of passes allowed.
-MOST_PASSES = 10**9
-
-#: Memory for histograms, unless another one is requested [GB].
-DEFAULT_MAX_MEMORY_GB = 2.0
-
-#: Smallest share of a full pass's paths.
-SMALLEST_SHARE = 2**-9
+MOST_PASSES = 10**9  #: Largest number of passes allowed.
+DEFAULT_MAX_MEMORY_GB = 2.0  #: Memory for histograms, unless another one is requested [GB].
+SMALLEST_SHARE = 2**-9  #: Smallest share of a full pass's paths.
 
 TargetError = Annotated[
     float | None,
@@ -135,8 +130,7 @@ class RenderOptions:
 
 logger = logging.getLogger(__name__)
 
-#: Share of the energy lost at the surface mesh's edge above which a warning is given.
-TOLERATED_LOSS = 1e-3
+TOLERATED_LOSS = 1e-3  #: Share of the energy lost at the surface mesh's edge above which a warning is given.
 
 #: Fewest passes to compare a standard error with the target; its own relative error is then 27 %.
 SMALLEST_PASS_COUNT = 8

@@ -43,11 +43,8 @@ from mitransient_lidar.transport.sensor.pixels import PixelArray
 
 logger = logging.getLogger(__name__)
 
-#: Default end of a frame.
-DEFAULT_GOAL = Goal(target_error=0.05, max_time=120.0)
-
-#: Largest number of frames.
-MOST_FRAMES = 10_000
+DEFAULT_GOAL = Goal(target_error=0.05, max_time=120.0)  #: Default end of a frame.
+MOST_FRAMES = 10_000  #: Largest number of frames.
 
 #: Memory per pixel in a frame's passes, and per pixel of an image that is kept, and labelled at the end [bytes].
 _BYTES_PER_PIXEL, _BYTES_PER_FRAME = 150, 60

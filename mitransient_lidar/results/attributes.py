@@ -35,8 +35,7 @@ def _read() -> dict[str, tuple[str, str]]:
 
 VARIABLES = _read()
 
-#: Directions of coordinates that count downwards.
-_DOWN = ("gate_depth", "depth")
+_DOWN = ("gate_depth", "depth")  #: Directions of coordinates that count downwards.
 
 
 class PointClass(IntEnum):
@@ -117,8 +116,7 @@ _NUMBERS: dict[str, tuple[float, float]] = {
 #: Attributes that are a list over the pixels where they differ.
 PER_PIXEL = ("gain", "optical_density", "background_power_w", "fitting_gain", "fitting_optical_density")
 
-#: Those that count something, which is known.
-_COUNTS = ("passes", "most_passes", "pulses", "shots")
+_COUNTS = ("passes", "most_passes", "pulses", "shots")  #: Those that count something, which is known.
 
 #: Number of values in attributes that are lists of finite numbers, None for any.
 _LISTS: dict[str, int | None] = {

@@ -38,8 +38,7 @@ from mitransient_lidar.results.gate_stack import check_stack, has_frames
 #: Beginning of this package's files, and the mark before their SHA-256 at the end.
 SIGNATURE, _CHECKSUM = b"\x89HDF\r\n\x1a\n", b"mitransient-lidar sha256 "
 
-#: Attribute with the JSON of those that are not file attributes.
-OTHERS = "mitransient_lidar"
+OTHERS = "mitransient_lidar"  #: Attribute with the JSON of those that are not file attributes.
 
 #: Datasets that are written to the disk directly [bytes], and reserved space over their size.
 _LARGE, _RESERVED = 2**28, 1.1

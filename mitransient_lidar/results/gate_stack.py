@@ -27,8 +27,7 @@ from mitransient_lidar.results import sum_errors
 from mitransient_lidar.results.attributes import check_attributes, check_coordinates, label, made_from
 from mitransient_lidar.results.geometry import lidar_geometry, optional_number, required_number
 
-#: Dimensions that only results with time bins have.
-_OF_BINS = ("time", "origin", "batch", *sum_errors.DIMS)
+_OF_BINS = ("time", "origin", "batch", *sum_errors.DIMS)  #: Dimensions that only results with time bins have.
 
 _ROUNDING = 1e-6  # fraction of a bin by which rounded times may exceed the record
 

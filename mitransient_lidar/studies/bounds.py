@@ -35,8 +35,7 @@ from mitransient_lidar.rendering.render import render
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.studies.cases import Cases
 
-#: Most designs in a comparison.
-MOST_DESIGNS = 1000
+MOST_DESIGNS = 1000  #: Most designs in a comparison.
 
 _JOINED = ("bound", "bound_stderr", "bound_known", "variance_share", "monte_carlo_share", "correlation")
 

@@ -80,8 +80,7 @@ _RIGHT, _NONE, _ALL = 1.0, 0.05, 0.98
 #: Farthest place on the sea from its origin along x and y [m]; estimator of depths, as that of flights.
 _FARTHEST, _ESTIMATOR = 200.0, "gaussian"
 
-#: Wavelength of waters by name, which is that of the table of any green instrument [nm].
-_WAVELENGTH = 532.0
+_WAVELENGTH = 532.0  #: Wavelength of waters by name, which is that of the table of any green instrument [nm].
 
 #: Passes of light maps, as in flights, relative standard error of renders below their reach, and depths of a range.
 _PASSES, _ERROR, _IN_RANGE = 2, 0.05, 200

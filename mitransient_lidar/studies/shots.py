@@ -30,8 +30,7 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 if TYPE_CHECKING:
     import xarray as xr
 
-#: Largest number of pixels whose footprints are mapped.
-_MOST_MAPPED_PIXELS = 64
+_MOST_MAPPED_PIXELS = 64  #: Largest number of pixels whose footprints are mapped.
 
 _PASSES = 12
 
@@ -151,8 +150,7 @@ def _pixel_map(receiver: Receiver) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     return lines, np.where(np.array(held) > 0, np.array(index).astype(int), -1).reshape(x.shape)
 
 
-#: Half width of the gates about the echoes from a level sea [ns].
-_HALF_GATE_NS = 10.0
+_HALF_GATE_NS = 10.0  #: Half width of the gates about the echoes from a level sea [ns].
 
 
 def shot_statistics(series: xr.Dataset) -> xr.Dataset:

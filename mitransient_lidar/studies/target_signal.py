@@ -30,8 +30,7 @@ from mitransient_lidar.transport.solids import shape_groups
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
 _HALF_GATE = 1.0
 
-#: Jackknife pass groups.
-_GROUPS = 16
+_GROUPS = 16  #: Jackknife pass groups.
 
 
 def target_signal(

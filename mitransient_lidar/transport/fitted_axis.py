@@ -24,8 +24,7 @@ from mitransient_lidar.transport.scene import WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.solids import box_of
 
-#: Share of beam or view rays that the sea must reflect totally for the record to end there.
-_REFLECTED = 0.1
+_REFLECTED = 0.1  #: Share of beam or view rays that the sea must reflect totally for the record to end there.
 
 #: Least time of a fitted record before the first and after the last light [ns], and more after it in response times.
 _MARGIN_NS, _RESPONSE_TIMES = 12.0, 12.0

@@ -21,8 +21,7 @@ from mitransient_lidar.transport.sensor.receiver import Octaves, Receiver
 #: Shares of the peak irradiance at which a beam's outlines are drawn.
 OUTLINE_LEVELS = (float(np.exp(-0.5)), float(np.exp(-2)))
 
-#: Longest image side: 32-bit random numbers do not resolve finer cells.
-_LONGEST_SIDE = 2048
+_LONGEST_SIDE = 2048  #: Longest image side: 32-bit random numbers do not resolve finer cells.
 
 #: Image outlines that enclose less than this share of the largest one are dropped as noise.
 _SMALLEST_ISLAND = 0.02

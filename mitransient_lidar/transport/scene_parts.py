@@ -36,20 +36,14 @@ from mitransient_lidar.transport.solids import bottom_depths, children, shape_gr
 
 logger = logging.getLogger(__name__)
 
-#: Largest number of instances without a warning about the time that they need.
-_MANY_INSTANCES = 20
+_MANY_INSTANCES = 20  #: Largest number of instances without a warning about the time that they need.
 
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
 
-#: Wavelength difference that changes no water [nm].
-_SAME_NM = 1.0
-
-#: Relative refractive index difference that does not matter, more than the index of air.
-_SAME_INDEX = 1e-3
-
-#: Vertical component of an axis under water above which it looks up.
-_SMALLEST_RISE = 0.1
+_SAME_NM = 1.0  #: Wavelength difference that changes no water [nm].
+_SAME_INDEX = 1e-3  #: Relative refractive index difference that does not matter, more than the index of air.
+_SMALLEST_RISE = 0.1  #: Vertical component of an axis under water above which it looks up.
 
 
 def find_lidar_scene(

@@ -21,8 +21,7 @@ from mitransient_lidar.core.validation import usable_memory
 if TYPE_CHECKING:
     import xarray as xr
 
-#: Largest arrays of a map, a table or an image that a scene names [bytes].
-LARGEST_ARRAY = 2**28
+LARGEST_ARRAY = 2**28  #: Largest arrays of a map, a table or an image that a scene names [bytes].
 
 EXR_SIGNATURE = b"\x76\x2f\x31\x01"  #: First four bytes in every OpenEXR file.
 

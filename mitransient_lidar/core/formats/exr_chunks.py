@@ -20,8 +20,7 @@ from mitransient_lidar.core.files import open_file
 #: Lines per chunk, by compression number: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB.
 _LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)
 
-#: Numbers of the compressions ZIPS, ZIP and PXR24, whose data are zlib data.
-_ZIPS, _ZIP, _PXR24 = 2, 3, 5
+_ZIPS, _ZIP, _PXR24 = 2, 3, 5  #: Numbers of the compressions ZIPS, ZIP and PXR24, whose data are zlib data.
 
 #: Version bits: a single tiled part, parts with samples at several depths, several parts.
 _TILED, _DEEP, _SEVERAL = 0x200, 0x800, 0x1000

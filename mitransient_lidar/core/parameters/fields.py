@@ -21,11 +21,8 @@ from mitransient_lidar.core.validation import (
     number_within,
 )
 
-#: Text that leaves the choice of a value to the scene.
-AUTO = "auto"
-
-#: Wavelengths [nm] of lasers for which values at 532 nm stand.
-GREEN_LASERS = (510.0, 540.0)
+AUTO = "auto"  #: Text that leaves the choice of a value to the scene.
+GREEN_LASERS = (510.0, 540.0)  #: Wavelengths [nm] of lasers for which values at 532 nm stand.
 
 
 def is_green(wavelength_nm: float | None) -> bool:

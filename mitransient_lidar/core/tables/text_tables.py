@@ -37,17 +37,10 @@ MISSING = frozenset({"", "nan", "-nan", "na", "n/a", "<na>", "#n/a", "#na", "nul
 #: Values that instruments write for missing ones.
 _FILL_VALUES = (-99.0, -999.0, -9999.0, -99999.0, -9.99e-29)
 
-#: Most lines in a table.
-_MOST_LINES = 10**6
-
-#: Lines in which the number of columns shows.
-_LINES_FOR_WIDTH = 10_000
-
-#: Characters of the lines above the first row in which the heading is looked for.
-_LONGEST_HEAD = 2**16
-
-#: Times [ns] without a unit that span less are probably seconds.
-_SHORTEST_RECORD = 1e-3
+_MOST_LINES = 10**6  #: Most lines in a table.
+_LINES_FOR_WIDTH = 10_000  #: Lines in which the number of columns shows.
+_LONGEST_HEAD = 2**16  #: Characters of the lines above the first row in which the heading is looked for.
+_SHORTEST_RECORD = 1e-3  #: Times [ns] without a unit that span less are probably seconds.
 
 _COMMENT = re.compile(r"(#(?!N/?A)|%|//|!)[#%/!]*\s*")
 _INLINE_COMMENT = re.compile(r"#(?!N/?A).*")
@@ -368,11 +361,8 @@ def is_number_or_missing(cell: str) -> bool:
     return cell.lower() in MISSING or _number(cell) is not None
 
 
-#: Largest table [bytes], and most rows in it.
-_LARGEST, _MOST_ROWS = 2**29, 10**7
-
-#: Beginning of a table in which its heading and its separator are found [bytes].
-_HEAD = 2**16
+_LARGEST, _MOST_ROWS = 2**29, 10**7  #: Largest table [bytes], and most rows in it.
+_HEAD = 2**16  #: Beginning of a table in which its heading and its separator are found [bytes].
 
 #: Chooses table columns by the names in its heading, empty without one: their indices and meanings.
 Choice = Callable[[list[str]], list[tuple[int, Heading]]]

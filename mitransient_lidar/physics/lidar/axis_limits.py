@@ -29,11 +29,8 @@ _FARTHEST = 10.0
 #: Horizontal distance from the lines of sight, over the depth, within which waves and scattering light a solid.
 _REACH_PER_DEPTH = 0.3
 
-#: Largest number of times that the height range of a solid in view is narrowed.
-_NARROWINGS = 6
-
-#: Directions at a cone's edge, and circles of such directions within it.
-_EDGE, _CIRCLES = 128, 8
+_NARROWINGS = 6  #: Largest number of times that the height range of a solid in view is narrowed.
+_EDGE, _CIRCLES = 128, 8  #: Directions at a cone's edge, and circles of such directions within it.
 
 #: A bottom that ends this share of its lines of sight makes the water below it count no more.
 _COVERED = 0.98

@@ -13,24 +13,19 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import ArrayLike, FloatArray, finite_array, in_range, positive
 
-#: Sun's angular radius [deg].
-SUN_RADIUS_DEG = 0.2666
-
-#: Largest sun zenith angle [deg].
-LARGEST_SUN_ZENITH_DEG = 89.0
+SUN_RADIUS_DEG = 0.2666  #: Sun's angular radius [deg].
+LARGEST_SUN_ZENITH_DEG = 89.0  #: Largest sun zenith angle [deg].
 
 #: Extraterrestrial irradiance [W m^-2 nm^-1]: mean over 527 to 537 nm in Gregg and Carder's table. Fraunhofer lines
 #: change it by up to 4 % within a nanometre.
 _SOLAR_CONSTANT = 1.90
 
-#: Ozone absorption [1/cm], same table, at 532 nm.
-_OZONE_ABSORPTION = 0.0662
+_OZONE_ABSORPTION = 0.0662  #: Ozone absorption [1/cm], same table, at 532 nm.
 
 #: Single-scattering albedo of maritime aerosol at 80 % relative humidity (equation 36, air mass type 1).
 _AEROSOL_ALBEDO = 0.993
 
-#: Pressure [hPa] for the Rayleigh optical depth.
-_SEA_LEVEL_PRESSURE = 1013.25
+_SEA_LEVEL_PRESSURE = 1013.25  #: Pressure [hPa] for the Rayleigh optical depth.
 
 
 class ClearSkyIrradiance(NamedTuple):

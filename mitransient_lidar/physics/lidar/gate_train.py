@@ -42,14 +42,12 @@ _POINTS, _MOST_POINTS = 128, 2**17
 #: Full length of a raised-cosine edge over its 10-90 % time: sin^2 passes 0.1 and 0.9 at 0.2048 and 0.7952 of it.
 _EDGE_PER_RISE = float(np.pi / (np.pi - 2 * np.arccos(0.8)))
 
-#: Cells per bin that give the error of cut gates.
-_CELLS_OF_BIN = 33
+_CELLS_OF_BIN = 33  #: Cells per bin that give the error of cut gates.
 
 #: Samples per standard deviation in a jittered edge, and standard deviations on each side.
 _JITTER_POINTS, _JITTER_REACH = 32, 6.0
 
-#: Relative tolerance for half edges against the width, for rounded decimals.
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  #: Relative tolerance for half edges against the width, for rounded decimals.
 
 _TRANSMISSION = Column("transmission", ("transmittance", "gate", "gain", "value"), UNITLESS)
 
@@ -339,8 +337,7 @@ class GatePlan:
     start: float
 
 
-#: Orders in which a camera takes the gates of a frame.
-ORDERS = ("in_order", "interleaved", "random")
+ORDERS = ("in_order", "interleaved", "random")  #: Orders in which a camera takes the gates of a frame.
 
 
 @dataclass(frozen=True)

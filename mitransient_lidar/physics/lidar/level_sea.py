@@ -17,11 +17,8 @@ from mitransient_lidar.core.parameters.fields import Read
 from mitransient_lidar.core.validation import ArrayLike, Checked, FloatArray, checked, finite_array, in_range, positive
 from mitransient_lidar.physics.lidar.pose import Pose
 
-#: Steps of Newton's method, and the relative change at which it ends.
-_STEPS, _CHANGE = 60, 4e-16
-
-#: Directions nearer to the horizon than this sine are taken as horizontal.
-_SMALLEST_DESCENT = 1e-9
+_STEPS, _CHANGE = 60, 4e-16  #: Steps of Newton's method, and the relative change at which it ends.
+_SMALLEST_DESCENT = 1e-9  #: Directions nearer to the horizon than this sine are taken as horizontal.
 
 
 @dataclass(frozen=True)

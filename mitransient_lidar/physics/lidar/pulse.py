@@ -22,9 +22,7 @@ FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
 _TAIL = 1e-10  # energy left out at each kernel end
 _MOST_BINS = 10**7  # in a kernel
 _LONGEST_DIRECT = 2000  # bins of a kernel from which Fourier transforms are faster
-
-#: Lowest sample in a file relative to the largest one; negative samples are noise.
-_LOWEST_SAMPLE = -0.1
+_LOWEST_SAMPLE = -0.1  #: Lowest sample in a file relative to the largest one; negative samples are noise.
 
 _POWER = Column(
     "power",

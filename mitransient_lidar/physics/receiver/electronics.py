@@ -83,8 +83,7 @@ class LowPass:
         return np.asarray(sum(by_lag[..., lag : lag + count : stride, lag] for lag in range(bins)))
 
 
-#: Without a low-pass a sample is the mean of its bin.
-MEAN_OF_BINS = LowPass(1, -1, np.ones(1))
+MEAN_OF_BINS = LowPass(1, -1, np.ones(1))  #: Without a low-pass a sample is the mean of its bin.
 
 
 @dataclass(frozen=True)

@@ -358,7 +358,5 @@ def _cameras() -> Mapping[str, Camera]:
     return MappingProxyType({name: Camera.of(given, f"{path.name}: {name}", name=name) for name, given in tables})
 
 
-#: Typical chains for 532 nm, with their sources.
-RECEIVERS = _presets()
-#: Typical gated cameras for 532 nm, with their sources.
-CAMERAS = _cameras()
+RECEIVERS = _presets()  #: Typical chains for 532 nm, with their sources.
+CAMERAS = _cameras()  #: Typical gated cameras for 532 nm, with their sources.

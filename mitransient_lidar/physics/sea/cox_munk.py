@@ -12,11 +12,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 
-#: Largest wind speed in all sea models [m/s].
-MAX_WIND_SPEED = 30.0
-
-#: Wind speeds at which Cox and Munk measured [m/s].
-MEASURED_WIND = 1.0, 14.0
+MAX_WIND_SPEED = 30.0  #: Largest wind speed in all sea models [m/s].
+MEASURED_WIND = 1.0, 14.0  #: Wind speeds at which Cox and Munk measured [m/s].
 
 #: Largest share of slopes, by the Gaussian part, for which a series may have a negative density.
 LARGEST_NEGATIVE_SHARE = 0.005
@@ -142,8 +139,7 @@ LAWS = ("monahan_omuircheartaigh_1980", "callaghan_2008", "stramska_petelski_200
 #: Reflectance over that at short wavelengths, at wavelengths [nm].
 _SHAPE = ((500.0, 1.0), (600.0, 0.95), (1000.0, 0.5), (1100.0, 0.45))
 
-#: Distance within which crests rise above their surroundings [m].
-SURROUNDINGS = 2.0
+SURROUNDINGS = 2.0  #: Distance within which crests rise above their surroundings [m].
 
 
 def foam_cover(foam: str, wind_speed: float) -> float:

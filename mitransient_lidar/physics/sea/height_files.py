@@ -20,14 +20,12 @@ from mitransient_lidar.core.validation import FloatArray, finite, positive
 
 logger = logging.getLogger(__name__)
 
-#: Relative tolerance of even spacing, for 32-bit numbers and rounded decimals.
-UNEVENNESS = 1e-3
+UNEVENNESS = 1e-3  #: Relative tolerance of even spacing, for 32-bit numbers and rounded decimals.
 
 #: Most scattered points, whose triangulation takes a kilobyte and 10 microseconds each.
 _MOST_SCATTERED = 2 * 10**6
 
-#: Least share of grid cells with a point for points to count as a grid.
-_LEAST_SHARE = 0.25
+_LEAST_SHARE = 0.25  #: Least share of grid cells with a point for points to count as a grid.
 
 _X = Column("x", ("easting", "east", "e", "x coordinate", "point x"), METRES)
 _Y = Column("y", ("northing", "north", "n", "y coordinate", "point y"), METRES)
@@ -44,8 +42,7 @@ _ALLOWED = "m, cm, km, ft, ftUS, fathom"
 _NETCDF_NAMES = ("height", "elevation", "depth")
 _NO_UNIT = ("", "1")
 
-#: Grid mapping attributes.
-_GRID_MAPPING = {"crs_wkt", "spatial_ref", "grid_mapping_name"}
+_GRID_MAPPING = {"crs_wkt", "spatial_ref", "grid_mapping_name"}  #: Grid mapping attributes.
 
 
 def length_unit(name: str, unit: str) -> float:

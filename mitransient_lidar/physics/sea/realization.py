@@ -24,8 +24,7 @@ from mitransient_lidar.physics.sea.wave_spectrum import (
 #: Largest number of cells per grid side, and number of cells in the long-wave grids of a finer sea.
 _MOST_CELLS, _LONG_WAVE_CELLS = 2048, 1024
 
-#: Largest ratio between the periods of neighbouring grids, odd.
-_MOST_TILES = 31
+_MOST_TILES = 31  #: Largest ratio between the periods of neighbouring grids, odd.
 
 #: Most wavelengths per period of waves that are summed one by one. Others are interpolated on a grid with so many times
 #: the fewest points, by a kernel over so many of them, whose decay suits both.

@@ -19,8 +19,7 @@ HEIGHT_PER_DEPTH = 0.5
 #: Ratio between the wavenumbers of neighbouring bands, the first over the peak wavenumber, and the last [rad/m].
 _BAND, _FIRST_BAND, _LAST_BAND = math.sqrt(2), 0.25, 2 * math.pi
 
-#: Amplitude deficit that counts as none: a micrometre in a wave of one metre.
-_NO_CHANGE = 1e-6
+_NO_CHANGE = 1e-6  #: Amplitude deficit that counts as none: a micrometre in a wave of one metre.
 
 #: Depths in the amplitude table: the least one [m], their ratio, and the deepest one times the first wavenumber.
 _LEAST_DEPTH, _DEPTH_RATIO, _DEEPEST = 1e-4, 1.05, 10.0
@@ -81,8 +80,7 @@ class DepthResponse:
     """
 
     depth: FloatArray  #: Increasing depths [m], the first 0, shape (n,).
-    #: Amplitude factors [1], shape (bands, n): wind waves by wavenumber, then swell.
-    amplitude: FloatArray
+    amplitude: FloatArray  #: Amplitude factors [1], shape (bands, n): wind waves by wavenumber, then swell.
     top: int  #: Band number of the shortest wind waves.
     #: Share by which the largest height lessens the effective depth [1], 0 in deep water to 1 at the shore, shape (n,)
     broken: FloatArray

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 
-#: Highest wind speed in the model [m/s].
-STRONGEST_WIND = 20.0
+STRONGEST_WIND = 20.0  #: Highest wind speed in the model [m/s].
 
 CLEAN_BACKSCATTER = 233.0
 """Volume scattering at 180 degrees over void fraction for clean bubbles of any size [1/(m sr)] (Churnside 2010)."""

@@ -231,8 +231,7 @@ def _angle(s: npt.ArrayLike) -> FloatArray:
     return np.asarray(2 * np.arcsin(np.sqrt(np.minimum(s, 1))))
 
 
-#: Nodes of the fine table: 822 in the backward hemisphere, more than measurements have there.
-_COUNT = 32768
+_COUNT = 32768  #: Nodes of the fine table: 822 in the backward hemisphere, more than measurements have there.
 
 _FEWEST_ANGLES = 10
 _SMALLEST_LAST_DEG = 170.0

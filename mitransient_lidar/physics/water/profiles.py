@@ -63,11 +63,8 @@ _OTHER_QUANTITIES = frozenset(
     }
 )
 
-#: Tolerance, relative to c, of more than two given properties, for rounded decimals.
-_DISAGREEMENT = 0.02
-
-#: Bisections for the end of a layer that crosses a node.
-_BISECTIONS = 20
+_DISAGREEMENT = 0.02  #: Tolerance, relative to c, of more than two given properties, for rounded decimals.
+_BISECTIONS = 20  #: Bisections for the end of a layer that crosses a node.
 
 _Columns = dict[str, FloatArray]
 

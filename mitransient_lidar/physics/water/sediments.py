@@ -28,8 +28,7 @@ _TABLES = {
 }
 BOTTOMS = tuple(name for names in _TABLES.values() for name in names)
 
-#: Halvings of the albedo range that leave the rounding error.
-_BISECTIONS = 52
+_BISECTIONS = 52  #: Halvings of the albedo range that leave the rounding error.
 
 #: Incidences at which energy is checked [deg]: the reflectance grows towards the horizon.
 _CHECKED_DEG = (0.0, 45.0, 70.0, 80.0, 88.0)

@@ -22,14 +22,12 @@ from mitransient_lidar.physics.water.phase_table import PowerLawTable
 #: Least downward component of a direction: light that is more nearly level leaves beam and view.
 _LEVEL = 0.01
 
-#: Largest number of events of a way.
-_MOST_EVENTS = 200
+_MOST_EVENTS = 200  #: Largest number of events of a way.
 
 #: Ways, and pairs of them, for each path: paths are sorted by displacement, and one stands for its neighbours.
 _WAYS, _PAIRS = 16, 8
 
-#: Least scattering coefficient, so that optical depths increase strictly [1/m].
-_LEAST_SCATTERING = 1e-12
+_LEAST_SCATTERING = 1e-12  #: Least scattering coefficient, so that optical depths increase strictly [1/m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,14 +220,9 @@ def _turned(direction: FloatArray, theta: FloatArray, rng: np.random.Generator) 
     return np.asarray(turned / np.linalg.norm(turned, axis=0))
 
 
-#: Nodes in the inverse of a phase function's distribution.
-_NODES = 8192
-
-#: Scattering by more is loss: the light has left the beam [rad].
-LARGEST_ANGLE = np.radians(80.0)
-
-#: Displacement in place of displacements by larger angles [m].
-_FAR = 1e6
+_NODES = 8192  #: Nodes in the inverse of a phase function's distribution.
+LARGEST_ANGLE = np.radians(80.0)  #: Scattering by more is loss: the light has left the beam [rad].
+_FAR = 1e6  #: Displacement in place of displacements by larger angles [m].
 
 
 def scattering_angles(phase: PowerLawTable, u: FloatArray) -> FloatArray:

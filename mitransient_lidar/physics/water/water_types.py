@@ -39,8 +39,7 @@ GREEN_RANGE = (531.0, 533.0)
 #: Wavelengths [nm] at which Petzold's waters are used: from the centre of his filter to the usual laser.
 _PETZOLD_RANGE = (514.0, GREEN_RANGE[1])
 
-#: Decay of the absorption by dissolved matter with the wavelength [1/nm].
-_DISSOLVED_SLOPE = 0.014
+_DISSOLVED_SLOPE = 0.014  #: Decay of the absorption by dissolved matter with the wavelength [1/nm].
 
 #: Nodes of the table that integrates a measured phase function; 822 lie in the backward hemisphere.
 _NODES = 32768
@@ -48,8 +47,7 @@ _NODES = 32768
 #: b, bb and the scattering by molecules bw [1/m].
 Scattered = tuple[float, float, float]
 
-#: bb/b of particles in the open ocean (Westberry et al. 2010).
-_OCEANIC_BACKSCATTER_RATIO = 0.010
+_OCEANIC_BACKSCATTER_RATIO = 0.010  #: bb/b of particles in the open ocean (Westberry et al. 2010).
 
 #: Diffuse attenuation Kd, and scattering where it was measured [1/m], by Jerlov's types.
 _JERLOV: dict[str, tuple[float, float | None]] = {

@@ -106,9 +106,7 @@ _SIGHTS = ("surface_time", "depth_per_ns")  # coordinates of `geometry.LinesOfSi
 _WAVEFORMS = ("waveform", "waveform_stderr")
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
 _STRIP_ASPECT = 4.0  # at most, of pixels drawn side by side
-
-#: Most numbers that are embedded exactly.
-_EXACT = 400_000
+_EXACT = 400_000  #: Most numbers that are embedded exactly.
 
 #: Binary digits kept of values without errors, of errors, and of values per error.
 _VALUE_BITS, _ERROR_BITS, _BITS_PER_ERROR = 12, 5, 3

@@ -314,8 +314,7 @@ def _draw_pixel_gates(figure: Figure, stack: xr.Dataset, *, log: bool) -> None:
 #: Share of the pixels that may be brighter than white, or darker than black: glints would leave the rest black.
 _CLIPPED = 0.01
 
-#: Smallest animation width [pixels].
-_ANIMATION_WIDTH = 384
+_ANIMATION_WIDTH = 384  #: Smallest animation width [pixels].
 
 
 def plot_passive(dataset: xr.Dataset, path: drawing.FilePath | None = None, frame: int = 0) -> Figure:

@@ -36,8 +36,7 @@ from mitransient_lidar.studies.shots import render_found_shots
 
 DEPTH_LABEL = "depth on the axis (m)"
 
-#: Names of the pixel colours, for legends.
-PIXELS = ("red (0)", "green (1)", "blue (2)", "black (3)")
+PIXELS = ("red (0)", "green (1)", "blue (2)", "black (3)")  #: Names of the pixel colours, for legends.
 
 
 def draw_waveforms(

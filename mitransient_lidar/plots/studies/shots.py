@@ -21,8 +21,7 @@ from mitransient_lidar.plots.studies.panels import finish
 from mitransient_lidar.rendering.shots.truth import Shot
 from mitransient_lidar.studies.shots import RenderedShots, depth_bias, slope_correlations, slope_effects
 
-#: Share of a pixel's peak that counts as an echo.
-_FAINT = 5e-3
+_FAINT = 5e-3  #: Share of a pixel's peak that counts as an echo.
 
 
 def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = None) -> Figure:

@@ -36,11 +36,8 @@ from mitransient_lidar.transport.probe import land_of_shots
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
 from mitransient_lidar.transport.solids import scene_of_shapes
 
-#: Paths of all shots in a launch, and time bins of all their pixels.
-_PATHS, _BINS = 2**17, 2**24
-
-#: Largest number of shots in a batch: their sea has 120 000 triangles a shot.
-_MOST_SHOTS = 64
+_PATHS, _BINS = 2**17, 2**24  #: Paths of all shots in a launch, and time bins of all their pixels.
+_MOST_SHOTS = 64  #: Largest number of shots in a batch: their sea has 120 000 triangles a shot.
 
 #: Memory per bin in a series, for mean and standard error of energy and power, and their copy in the result [bytes].
 _BYTES_PER_BIN = 64

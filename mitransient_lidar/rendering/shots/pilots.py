@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotPoses
     from mitransient_lidar.rendering.shots.scene import ShotScene
 
-#: Most pilot shots, and farthest place of theirs along x and y [m].
-PILOTS, _WITHIN = 128, 200.0
+PILOTS, _WITHIN = 128, 200.0  #: Most pilot shots, and farthest place of theirs along x and y [m].
 
 #: Passes of pilot shots by merging and by light maps, and the relative error for which a merged pass has paths.
 MERGED_PASSES, _MAP_PASSES, _ERROR = 4, 2, 0.1

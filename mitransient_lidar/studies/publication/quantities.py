@@ -44,8 +44,7 @@ Quantities = dict[str, Measured]
 #: Depths between which the decay of the backscatter is fitted, and backscatter is compared [m].
 _COLUMN = (2.0, 6.5)
 
-#: Least field of view in the publication's table 1 [rad].
-_LEAST_FIELD_OF_VIEW = 0.010
+_LEAST_FIELD_OF_VIEW = 0.010  #: Least field of view in the publication's table 1 [rad].
 
 #: Other locations with the slopes of two shots.
 _COMBINATIONS = f"combinations of {PLACES_OF_SLOPE * len(SEAS)} places of each slope on {len(SEAS)} seas"

@@ -26,8 +26,7 @@ from mitransient_lidar.transport.rng import pass_streams, stratified_point
 from mitransient_lidar.transport.sensor.pixels import PixelArray, parse_layout
 from mitransient_lidar.transport.sensor.receiver import Receiver, SensorSample, solid_angle_factor
 
-#: Number of the random streams within a pass.
-_STREAM = 4
+_STREAM = 4  #: Number of the random streams within a pass.
 
 #: Number of scattering events beyond which paths survive each with this probability: without absorption they would not
 #: end.
@@ -159,15 +158,11 @@ class DaylightIntegrator(Protocol):
 
     plugin: str
     passive: bool
-    #: Returns the pass renderer for a scene.
-    prepare: Callable[[mi.Scene, mi.Sensor], DaylightRenderer]
+    prepare: Callable[[mi.Scene, mi.Sensor], DaylightRenderer]  #: Returns the pass renderer for a scene.
 
 
-#: Least number of points along each field-of-view axis for the pixels' solid angles.
-_LATTICE = 4096
-
-#: Number of rays for the share of the field of view outside the surface mesh.
-_RAYS = 2**14
+_LATTICE = 4096  #: Least number of points along each field-of-view axis for the pixels' solid angles.
+_RAYS = 2**14  #: Number of rays for the share of the field of view outside the surface mesh.
 
 
 class FovSampler:

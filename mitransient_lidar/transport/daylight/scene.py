@@ -15,8 +15,7 @@ from mitransient_lidar.transport.plugin_types import Daylight, SkyEmitter, SunEm
 from mitransient_lidar.transport.scene import WaterScene
 from mitransient_lidar.transport.scene_parts import find_receiver, find_solids, fit_seas
 
-#: Largest angle between the sun and the sun of a clear sky [deg].
-_SAME_DIRECTION_DEG = 0.05
+_SAME_DIRECTION_DEG = 0.05  #: Largest angle between the sun and the sun of a clear sky [deg].
 
 
 @dataclass(frozen=True)
@@ -71,8 +70,7 @@ def _check_sun(sun: SunEmitter, sky: SkyEmitter) -> None:
         )
 
 
-#: Points along each axis of the quadrature that normalises a sky.
-_QUADRATURE_POINTS = 1024
+_QUADRATURE_POINTS = 1024  #: Points along each axis of the quadrature that normalises a sky.
 
 
 def direction_of(zenith_deg: float, azimuth_deg: float) -> NDArray[np.float64]:

@@ -30,11 +30,8 @@ class HasTable(Protocol):
 #: Beyond this number of different mixtures, bb/b and pure water's share are rounded to this step in their logarithms.
 _MOST_FUNCTIONS, _STEP = 16, 0.02
 
-#: bb/b where there are no particles, without effect.
-_ANY_RATIO = 0.0183
-
-#: Share of the scattering below which pure water is left out.
-_SMALLEST_SHARE = 1e-4
+_ANY_RATIO = 0.0183  #: bb/b where there are no particles, without effect.
+_SMALLEST_SHARE = 1e-4  #: Share of the scattering below which pure water is left out.
 
 
 class ScattererPhases:

@@ -16,18 +16,14 @@ from mitransient_lidar.transport.opaque import changed, opaque, opaque_point
 from mitransient_lidar.transport.rng import starts
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Base-2 logarithm of the largest number of buckets per shot.
-MOST_BUCKET_BITS = 20
-
-#: Largest growth of cell width with depth.
-_MOST_GROWTH = 4.0
+MOST_BUCKET_BITS = 20  #: Base-2 logarithm of the largest number of buckets per shot.
+_MOST_GROWTH = 4.0  #: Largest growth of cell width with depth.
 
 #: Growth of layer thickness with depth, up to the final one: facets focus light in patterns that change with depth, and
 #: twice this growth loses 3 % of the column below 15 cm waves.
 _THICKNESS_PER_DEPTH = 0.25
 
-#: Least thickness of the uppermost layer, over the final one.
-_LEAST_THICKNESS = 0.01
+_LEAST_THICKNESS = 0.01  #: Least thickness of the uppermost layer, over the final one.
 
 #: Least vertical component of the directions along which points move to their layer's plane.
 _LEAST_DESCENT = 0.5
@@ -38,8 +34,7 @@ _LEAST_CUT, _LEAST_WEDGE = 0.25, 0.01
 #: Steps to the surface above a point along the beam, and least volume below a slope over that below level water.
 _SURFACE_STEPS, _LEAST_STRETCH = 2, 0.1
 
-#: Least sea slope, against division by zero.
-_LEAST_SLOPE = 1e-9
+_LEAST_SLOPE = 1e-9  #: Least sea slope, against division by zero.
 
 #: Halo of the unscattered light's profile relative to its core, and squared distance from the axis, in standard
 #: deviations, that parts both.
@@ -48,8 +43,7 @@ _HALO, _SQUARES_INSIDE = 0.02, 25.0
 #: Step of the planes' places from one layer to the next, which distributes them evenly: the golden ratio.
 _PLANE_STEP = 0.618034
 
-#: Added to cell numbers so that they are positive.
-ORIGIN = 1 << 20
+ORIGIN = 1 << 20  #: Added to cell numbers so that they are positive.
 
 
 @dataclass(frozen=True)
@@ -348,8 +342,7 @@ _RING_PER_SPREAD, _CORE_SPREADS = 0.1, 2.0
 #: Largest thickness of a shell over its radius: the light decreases by its square.
 _THICKNESS_PER_RADIUS = 0.04
 
-#: Smallest shell radius [m].
-_SMALLEST_RADIUS = 1e-3
+_SMALLEST_RADIUS = 1e-3  #: Smallest shell radius [m].
 
 #: Base-2 logarithm of the number of buckets, and bits for the numbers of ring and sector.
 _BUCKET_BITS, _RING_BITS, _SECTOR_BITS = 20, 11, 9

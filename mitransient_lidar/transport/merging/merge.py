@@ -160,8 +160,7 @@ def receive(
     received.histogram.lose(energy, active & lost)
 
 
-#: Points of the receiver's paths for each one that is connected.
-_POINTS_PER_CONNECTION = 4
+_POINTS_PER_CONNECTION = 4  #: Points of the receiver's paths for each one that is connected.
 
 #: Distance between the place of a photon and where a ray meets its solid, absolute [m] and over the ray's length.
 _TOLERANCE, _RELATIVE_TOLERANCE = 1e-3, 1e-4

@@ -22,11 +22,8 @@ _CORE_PER_METRE = 0.05
 #: Least cosine of the axis with the vertical, for axes close to the horizon and above it.
 _SMALLEST_COSINE = 0.01
 
-#: Largest slope of the axis against the vertical along which patches are projected.
-_LARGEST_SLANT = 2.0
-
-#: Core radius at the surface over the beam's standard deviation there.
-CORE_PER_SPREAD = 2.0
+_LARGEST_SLANT = 2.0  #: Largest slope of the axis against the vertical along which patches are projected.
+CORE_PER_SPREAD = 2.0  #: Core radius at the surface over the beam's standard deviation there.
 
 #: Least and largest width of cells on the axis, over the core radius: rings have different 32-bit numbers, and are not
 #: wider than the beam.

@@ -159,11 +159,8 @@ class SegmentBuffer:
         )
 
 
-#: Numbers in a packet.
-_PACKET = 4
-
-#: Sign bit of a number, and all other bits.
-_SIGN, _MAGNITUDE = 1 << 31, (1 << 31) - 1
+_PACKET = 4  #: Numbers in a packet.
+_SIGN, _MAGNITUDE = 1 << 31, (1 << 31) - 1  #: Sign bit of a number, and all other bits.
 
 
 class PackedStore:

@@ -15,8 +15,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index
 from mitransient_lidar.transport.perturbations import Perturbations, Sums
 
-#: Largest number of sums: more do not fit a laptop's memory.
-_LARGEST = 2**28
+_LARGEST = 2**28  #: Largest number of sums: more do not fit a laptop's memory.
 
 #: Share of a gate's largest weight below which others are neglected: 5 standard deviations of a Gaussian pulse.
 _SMALLEST_WEIGHT = 1e-7

@@ -31,8 +31,7 @@ _MANY_PIXEL_BITS, _MOST_COUNTED = 28, 15
 
 _MOST = (1 << _ORDER_BITS) - 1
 
-#: Largest number of orders that can be separated.
-MOST_ORDERS = _MOST - 1
+MOST_ORDERS = _MOST - 1  #: Largest number of orders that can be separated.
 
 #: Origins without a solid: light that has met the sea surface alone, and light that the water has scattered.
 ORIGINS = ("surface", "water")

@@ -17,8 +17,7 @@ from mitransient_lidar.transport.scene import LidarScene, WaterScene
 #: Newton steps towards Snell's law: four leave less than 1e-4 rad even 5 m above and 40 m below the sea at 80 degrees.
 _NEWTON_STEPS = 4
 
-#: Smallest depth of a point [m], which keeps the equations regular at the surface.
-_SMALLEST_DEPTH = 1e-4
+_SMALLEST_DEPTH = 1e-4  #: Smallest depth of a point [m], which keeps the equations regular at the surface.
 
 
 @dataclass

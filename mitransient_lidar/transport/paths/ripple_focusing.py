@@ -26,14 +26,9 @@ from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.perturbations import Perturbation, Sums
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Largest depth in the table [m], and its number of depths.
-_DEEPEST, _DEPTHS = 60.0, 20
-
-#: Largest number of forward scattering events that is distinguished.
-_MOST_EVENTS = 7
-
-#: Displacement samples.
-_SAMPLES = 1000
+_DEEPEST, _DEPTHS = 60.0, 20  #: Largest depth in the table [m], and its number of depths.
+_MOST_EVENTS = 7  #: Largest number of forward scattering events that is distinguished.
+_SAMPLES = 1000  #: Displacement samples.
 
 
 @dataclass(frozen=True)

@@ -24,14 +24,12 @@ logger = logging.getLogger(__name__)
 #: Names of the four pixels in the published receivers, in pixel order.
 PUBLISHED_NAMES = ("red", "green", "blue", "black")
 
-#: Layouts of more pixels than this are imagers by default.
-_LARGEST_LAYOUT = 16
+_LARGEST_LAYOUT = 16  #: Layouts of more pixels than this are imagers by default.
 
 #: Largest number of pixels in a receiver, and in one with rows and columns.
 MOST_PIXELS, _MOST_OF_LAYOUT = 2**20, 2**22
 
-#: Points in each pixel that find overlaps.
-_OVERLAP_POINTS = 4096
+_OVERLAP_POINTS = 4096  #: Points in each pixel that find overlaps.
 
 #: Cells of the table along a side for each pixel along a side, and at most.
 _CELLS_PER_PIXEL, _MOST_CELLS = 8, 256
@@ -287,8 +285,7 @@ def parse_layout(layout: str) -> tuple[int, int]:
     return (4, 1) if (rows, columns) == (1, 4) else (rows, columns)
 
 
-#: Integers up to this are exact in 32-bit images.
-_LARGEST_LABEL = 2**24
+_LARGEST_LABEL = 2**24  #: Integers up to this are exact in 32-bit images.
 
 
 class MappedPixels(PixelArray):
