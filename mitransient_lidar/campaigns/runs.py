@@ -110,10 +110,7 @@ class RunRenderer(Renderer):
     def series(self, number: int, values: Mapping[str, Any], **options: Any) -> xr.Dataset:
         """Return a run's shots, as from `render_shots`, from its row number and parameters.
 
-        Raises
-        ------
-        UserError
-            If the scene refuses the parameters, or the light does not fit the record.
+        Raises `UserError` if the scene refuses the parameters, or the light does not fit the record.
         """
         campaign, known = self.plan, self.scene.values
         params = {**campaign.fixed, **self.inputs(number, values)}

@@ -133,18 +133,8 @@ def render_in_process(
 
     Raises UserError if the store cannot be read or written, or the process has other versions than it must have.
 
-    Parameters
-    ----------
-    path
-        Store folder.
-    shard
-        Shard number.
-    retry
-        Whether to render runs that have failed, too.
-    report
-        Called with the numbers of runs done and failed after each run.
-    processes
-        Processes that the new one belongs to.
+    `path`: store folder. `shard`: shard number. `retry`: whether to render runs that have failed, too. `report`: called
+    with the numbers of runs done and failed after each run. `processes`: processes that the new one belongs to.
     """
     processes = processes or Processes()
     reasons: dict[int, str] = {}

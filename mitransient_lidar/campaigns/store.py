@@ -290,10 +290,7 @@ class Store:
     ) -> None:
         """Write a shard, its status last; one that another process has finished is left as it is.
 
-        Raises
-        ------
-        WriteError
-            If the operating system reports an error.
+        Raises `WriteError` if the operating system reports an error.
         """
         runs = self.runs_of(shard)
         if np.all(self.status(runs) == DONE):
@@ -368,10 +365,7 @@ def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
     runs are NaN, or 0 for integers. Runs that have lost an array in the store are planned; a damaged array raises
     ``ValueError`` when it is read.
 
-    Raises
-    ------
-    UserError
-        If there is no campaign store, or its coordinates are damaged.
+    Raises `UserError` if there is no campaign store, or its coordinates are damaged.
     """
     store = Store(path)
     with _reading(path, "a coordinate"):

@@ -98,27 +98,13 @@ class Light:
 class PassAccumulator:
     """Means and standard errors over a render's passes: all light, or gates alone.
 
-    Parameters
-    ----------
-    scene, window
-        The scene, and the bins whose errors count.
-    train
-        Gates at their times, or None.
-    origins
-        Names for the separated light origins.
-    parameters, differences
-        Parameters by which light is differentiated, and the subset with central differences.
-    batches
-        Number of pass batches whose power is kept.
-    kept
-        Whether ``histograms`` are kept, ``gates`` are cut from each pass histogram, or ``direct``: accumulated in the
-        pass.
-    smooth
-        Standard deviation by which each gate's image is smoothed [pixels], or None.
-    size
-        Memory of film, means and errors, for images of the whole render [bytes]; 0 if it is unknown.
-    tiles
-        Tiles of pixels whose ``direct`` gates are accumulated in turn in each pass, or one None for all pixels.
+    `scene`, `window`: the scene, and the bins whose errors count. `train`: gates at their times, or None. `origins`:
+    names for the separated light origins. `parameters`, `differences`: parameters by which light is differentiated, and
+    the subset with central differences. `batches`: number of pass batches whose power is kept. `kept`: whether
+    ``histograms`` are kept, ``gates`` are cut from each pass histogram, or ``direct``: accumulated in the pass.
+    `smooth`: standard deviation by which each gate's image is smoothed [pixels], or None. `size`: memory of film, means
+    and errors, for images of the whole render [bytes]; 0 if it is unknown. `tiles`: tiles of pixels whose ``direct``
+    gates are accumulated in turn in each pass, or one None for all pixels.
     """
 
     def __init__(

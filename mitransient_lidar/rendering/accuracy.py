@@ -90,12 +90,8 @@ def smoothing_bias(change: FloatArray, stderr: FloatArray, light: FloatArray, li
     A second smoothing changes a smooth image as the first one has changed the true image, to first order. Its noise is
     subtracted as if pixels were independent. Structure much finer than the smoothing is not seen.
 
-    Parameters
-    ----------
-    change, stderr
-        Change by a second smoothing of the smoothed part, and the part's standard error, shape (pixels, ...).
-    light, lit
-        All light, and which pixels count, in the same shape.
+    `change`, `stderr`: change by a second smoothing of the smoothed part, and the part's standard error, shape (pixels,
+    ...). `light`, `lit`: all light, and which pixels count, in the same shape.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         square = np.sum((change**2 - _NOISE_OF_BIAS * stderr**2) / light**2, axis=0, where=lit) / lit.sum(axis=0)

@@ -302,32 +302,15 @@ def run_passes(
 
     Warns when the passes or the time end before the requested error is reached, or the time before the passes.
 
-    Parameters
-    ----------
-    render_pass
-        Called with each pass's number and seed; returns the energy lost at the surface mesh's edge [J].
-    goal
-        Render end.
-    seed
-        Render seed, a 64-bit integer with a sign.
-    errors
-        Returns the relative standard errors, an array with any size; called from the second pass on.
-    errors_of
-        Unit to which the errors belong: ``bins``, ``gates`` or ``pixels``.
-    verify
-        Called with the number of passes at 8 passes, and at the end; raises UserError if the result is useless.
-    smallest
-        Number of passes that a result needs, at least 2: no goal ends the render before, and a Ctrl-C is raised, after
-        the second pass.
-    progress
-        Called after every pass.
+    `render_pass`: called with each pass's number and seed; returns the energy lost at the surface mesh's edge [J].
+    `goal`: render end. `seed`: render seed, a 64-bit integer with a sign. `errors`: returns the relative standard
+    errors, an array with any size; called from the second pass on. `errors_of`: unit to which the errors belong:
+    ``bins``, ``gates`` or ``pixels``. `verify`: called with the number of passes at 8 passes, and at the end; raises
+    UserError if the result is useless. `smallest`: number of passes that a result needs, at least 2: no goal ends the
+    render before, and a Ctrl-C is raised, after the second pass. `progress`: called after every pass.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        On a Ctrl-C during the first passes.
-    UserError
-        From `verify`, or if memory runs out.
+    Raises `KeyboardInterrupt` on a Ctrl-C during the first passes. Raises `UserError` from `verify`, or if memory runs
+    out.
     """
     count, lost, interrupted = 0, 0.0, False
     median = p95 = error = None

@@ -205,10 +205,7 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     the shots that were completed before Ctrl-C. `options`: options of the function that rendered the result, by default
     the values in its attributes. `params` are added to its scene's parameters.
 
-    Returns
-    -------
-    xarray.Dataset
-        As from the function that rendered the result.
+    Result: as from the function that rendered the result.
     """
     import xarray
 

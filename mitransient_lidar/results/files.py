@@ -230,20 +230,12 @@ def open(path: str | os.PathLike[str], **selection: Any) -> xr.Dataset:
 def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a dataset to a file atomically; an existing file is replaced.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Any dataset of this package for a NetCDF file; a result without further variables, a gate stack or images by
-        daylight for an EXR file.
-    path : path
-        Its suffix is the format: ``.nc`` is NetCDF-4, ``.exr`` OpenEXR; for gates and frames ``.tif`` and ``.png`` are
-        16-bit images, which `open` does not read (`image_files.write`). Without a suffix, a gate stack becomes a
-        sequence of EXR files ``<path>_gate000.exr`` and so on, one per gate.
+    `dataset`: any dataset of this package for a NetCDF file; a result without further variables, a gate stack or images
+    by daylight for an EXR file. `path`: its suffix is the format: ``.nc`` is NetCDF-4, ``.exr`` OpenEXR; for gates and
+    frames ``.tif`` and ``.png`` are 16-bit images, which `open` does not read (`image_files.write`). Without a suffix,
+    a gate stack becomes a sequence of EXR files ``<path>_gate000.exr`` and so on, one per gate.
 
-    Raises
-    ------
-    UserError
-        If the suffix is another one, the format cannot store the dataset, or the file cannot be written.
+    Raises `UserError` if the suffix is another one, the format cannot store the dataset, or the file cannot be written.
     """
     if not isinstance(dataset, xr.Dataset):
         raise UserError(f"dataset = {shown(dataset)} must be a dataset, an xarray.Dataset")

@@ -57,19 +57,12 @@ def beam_spread(
 
     Arguments as of `light_classes.scattering`.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``depth`` [m], increasing: ``transmitted`` and ``unscattered`` (shares of the energy that leaves the
-        laser), ``in_view`` (share of the light at the depth), ``centroid_x``, ``centroid_y``, ``radius_rms``,
-        ``radius_50``, ``radius_90``, ``shift_rms`` [m], ``delay_mean``, ``delay_std`` [ns]. Over ``depth`` and
-        ``radius`` [m] or ``delay`` [ns], the light shares ``within_radius``, ``within_shift`` and ``within_delay``.
-        Each has its standard error over the passes, ``..._stderr``. Without light, all but the first two are NaN.
-
-    Raises
-    ------
-    UserError
-        If the scene is invalid or has no water, or a number is out of range.
+    Result: over ``depth`` [m], increasing: ``transmitted`` and ``unscattered`` (shares of the energy that leaves the
+    laser), ``in_view`` (share of the light at the depth), ``centroid_x``, ``centroid_y``, ``radius_rms``,
+    ``radius_50``, ``radius_90``, ``shift_rms`` [m], ``delay_mean``, ``delay_std`` [ns]. Over ``depth`` and ``radius``
+    [m] or ``delay`` [ns], the light shares ``within_radius``, ``within_shift`` and ``within_delay``. Each has its
+    standard error over the passes, ``..._stderr``. Without light, all but the first two are NaN. Raises `UserError` if
+    the scene is invalid or has no water, or a number is out of range.
 
     Notes
     -----

@@ -160,13 +160,10 @@ def shot_statistics(series: xr.Dataset) -> xr.Dataset:
 
     `series`: a result of `rendering.shots.series.render_shots` for a scene with the parameter ``bottom_depth``.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``shot``: ``aim_x``, ``aim_y`` [m], ``slope_along``, ``slope_across`` (mean over the beam's footprint,
-        positive along for a face towards the lidar, [1]). Over ``shot`` and ``pixel``: ``surface_peak``,
-        ``bottom_peak`` [W], ``surface_time``, ``bottom_time`` [ns] at the waveform's highest point in a 20 ns gate
-        about the echo from a level sea; NaN where it lies at a gate limit.
+    Result: over ``shot``: ``aim_x``, ``aim_y`` [m], ``slope_along``, ``slope_across`` (mean over the beam's footprint,
+    positive along for a face towards the lidar, [1]). Over ``shot`` and ``pixel``: ``surface_peak``, ``bottom_peak``
+    [W], ``surface_time``, ``bottom_time`` [ns] at the waveform's highest point in a 20 ns gate about the echo from a
+    level sea; NaN where it lies at a gate limit.
     """
     columns: dict[str, FloatArray] = {name: series[name].values for name in ("aim_x", "aim_y")}
     columns |= {f"slope_{name}": series[f"true_slope_{name}"].values for name in ("along", "across")}

@@ -54,21 +54,14 @@ def target_signal(
     `passes`: independent passes per render, at least 16. `axis`: time bins instead of automatic ones. `is_lit`: whether
     a target that returns no light is refused. Others as of `detection.detect`.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``pixel`` and ``time`` [ns]: ``waveform`` (with the target), ``background`` (without) and ``difference``
-        [W]. Over ``pixel``, in a gate of two pulse widths about the peak of the summed difference: ``echo`` and
-        ``backscatter`` [J] in difference and background, their ratio ``contrast``, ``shadow`` [J] (negative part of the
-        difference after the gate), ``detectability`` and the best ``weight``. Over ``combination`` (``sum`` over all
-        pixels, ``best``: their weighted sum): ``combined_echo``, ``combined_contrast`` and ``combined_detectability``.
-        All with standard errors (for the gates: jackknife over 16 pass groups).
-
-    Raises
-    ------
-    UserError
-        If the scene or a parameter is invalid, there is no such shape, or it is above the sea or below the bottom. With
-        `is_lit`, if the sum of the pixels' echoes is not positive: it returns no light, or too little for these passes.
+    Result: over ``pixel`` and ``time`` [ns]: ``waveform`` (with the target), ``background`` (without) and
+    ``difference`` [W]. Over ``pixel``, in a gate of two pulse widths about the peak of the summed difference: ``echo``
+    and ``backscatter`` [J] in difference and background, their ratio ``contrast``, ``shadow`` [J] (negative part of the
+    difference after the gate), ``detectability`` and the best ``weight``. Over ``combination`` (``sum`` over all
+    pixels, ``best``: their weighted sum): ``combined_echo``, ``combined_contrast`` and ``combined_detectability``. All
+    with standard errors (for the gates: jackknife over 16 pass groups). Raises `UserError` if the scene or a parameter
+    is invalid, there is no such shape, or it is above the sea or below the bottom. With `is_lit`, if the sum of the
+    pixels' echoes is not positive: it returns no light, or too little for these passes.
 
     Notes
     -----

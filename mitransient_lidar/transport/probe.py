@@ -251,12 +251,8 @@ def land_of_shots(scene: LidarScene, shots: int) -> tuple[FloatArray, BoolArray]
 
     The scene is in parts, as a number of shots meet it.
 
-    Returns
-    -------
-    dry_ns
-        Earliest and latest arrival [ns], shape (shots x pixels, 2); NaN without one.
-    alone
-        Whether all that a pixel sees of the beam are solids in the air, shape (shots x pixels,).
+    Returns `dry_ns`: earliest and latest arrival [ns], shape (shots x pixels, 2); NaN without one. `alone`: whether all
+    that a pixel sees of the beam are solids in the air, shape (shots x pixels,).
     """
     pixels = scene.receiver.pixels
     count, slots = int(np.clip(_LAND_RAYS * pixels.count, _LAND_RAYS, PROBE_RAYS)), shots * pixels.count

@@ -91,18 +91,10 @@ def read_table(
     log. Raises `UserError` if the file cannot be read or is not text; a name, unit or wavelength is unknown, or a
     column is there twice; or a line does not contain one number for each column.
 
-    Parameters
-    ----------
-    path : path-like
-        Text file in UTF-8; a byte order mark may precede it.
-    columns : sequence of Column
-        Columns that the file may have.
-    ignored : collection of str
-        Names of other columns that it may have, in lower case; the log reports that they are not used.
-    wavelength_nm : float, optional
-        Wavelength [nm] of the columns, if the file has several.
-    positional : bool
-        Whether a file without heading has exactly `columns`, in their order and first units.
+    `path`: text file in UTF-8; a byte order mark may precede it. `columns`: columns that the file may have. `ignored`:
+    names of other columns that it may have, in lower case; the log reports that they are not used. `wavelength_nm`:
+    wavelength [nm] of the columns, if the file has several. `positional`: whether a file without heading has exactly
+    `columns`, in their order and first units.
     """
     text = read_text(path)
     if (count := text.count("\n")) > _MOST_LINES:

@@ -47,20 +47,10 @@ def clear_sky_irradiance(
 ) -> ClearSkyIrradiance:
     """Irradiance by sun and sky at 532 nm on the sea under a clear sky.
 
-    Parameters
-    ----------
-    zenith_deg : float
-        Sun zenith angle [deg], 0 to 89.
-    aerosol_optical_depth : float
-        Aerosol optical depth at 550 nm, 0 to 5.
-    angstrom_exponent : float
-        Exponent of its decrease with wavelength, -1 to 3; it also sets the aerosol's scattering asymmetry.
-    ozone_cm : float
-        Ozone column [atm cm], 0 to 1.
-    pressure_hpa : float
-        Pressure at sea level [hPa], 0 (no Rayleigh scattering) to 1100.
-    wavelength_nm : float
-        Wavelength [nm] that the irradiance must represent, 510 to 540.
+    `zenith_deg`: sun zenith angle [deg], 0 to 89. `aerosol_optical_depth`: aerosol optical depth at 550 nm, 0 to 5.
+    `angstrom_exponent`: exponent of its decrease with wavelength, -1 to 3; it also sets the aerosol's scattering
+    asymmetry. `ozone_cm`: ozone column [atm cm], 0 to 1. `pressure_hpa`: pressure at sea level [hPa], 0 (no Rayleigh
+    scattering) to 1100. `wavelength_nm`: wavelength [nm] that the irradiance must represent, 510 to 540.
 
     Notes
     -----

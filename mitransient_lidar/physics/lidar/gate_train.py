@@ -232,12 +232,8 @@ class GateTrain(Checked):
         `gate`: gate index, 0 to count - 1. `time_start_ns`, `bin_width_ns`: start of the first bin, and bin width [ns].
         `bin_count`: number of bins, 1 to 10^9.
 
-        Returns
-        -------
-        first : int
-            First bin that the gate overlaps.
-        weights : ndarray, shape (M,)
-            Exact means of the transmission over bins first to first + M - 1; M is 0 for a gate outside the axis.
+        Returns `first`: first bin that the gate overlaps. `weights`, shape (M,): exact means of the transmission over
+        bins first to first + M - 1; M is 0 for a gate outside the axis.
         """
         start, width = finite("time_start_ns", time_start_ns), positive("bin_width_ns", bin_width_ns)
         bins = integer("bin_count", bin_count, 1, 10**9)

@@ -140,10 +140,7 @@ def fresnel(theta: ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
     `theta`: incidence angle [rad], 0 to pi/2. `n`: index behind the interface relative to that before it; below 1 from
     water to air.
 
-    Returns
-    -------
-    reflectance, transmittance : ndarray
-        They add up to 1; the reflectance is 1 beyond the critical angle.
+    Returns `reflectance`, `transmittance`: they add up to 1; the reflectance is 1 beyond the critical angle.
     """
     angle = finite_array("theta", theta)
     cos_i = np.cos(angle)

@@ -122,23 +122,13 @@ class ReceiverChain:
 
         Returns the signal in `units`, and whether amplifier or digitiser are saturated.
 
-        Parameters
-        ----------
-        power : array_like, shape (..., time)
-            Mean optical power of the signal on the detector in each bin [W], not negative.
-        bin_width_ns : float
-            Bin width [ns], positive.
-        shots : int
-            Number of shots, 1 to 10^9.
-        seed : int
-            Seed of the random numbers, 0 to 2^63 - 1. The same arguments give the same samples on any number of cores.
-        background : array_like
-            Constant power added to the signal [W], not negative: a number, or one for each record.
-        series : bool
-            Whether the first power axis counts different pulses, each with its own energy and trigger. All other
-            records are channels that share a shot's energy and trigger.
-        common_seed : int, optional
-            Seed of energy and trigger, by default `seed`: the same one for channels that are drawn one by one.
+        `power`, shape (..., time): mean optical power of the signal on the detector in each bin [W], not negative.
+        `bin_width_ns`: bin width [ns], positive. `shots`: number of shots, 1 to 10^9. `seed`: seed of the random
+        numbers, 0 to 2^63 - 1. The same arguments give the same samples on any number of cores. `background`: constant
+        power added to the signal [W], not negative: a number, or one for each record. `series`: whether the first power
+        axis counts different pulses, each with its own energy and trigger. All other records are channels that share a
+        shot's energy and trigger. `common_seed`: seed of energy and trigger, by default `seed`: the same one for
+        channels that are drawn one by one.
         """
         light, sky = self._light(power, bin_width_ns, background)
         number, start = integer("shots", shots, 1, 10**9), integer("seed", seed, 0, 2**63 - 1)

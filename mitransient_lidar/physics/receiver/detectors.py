@@ -62,14 +62,8 @@ class SignalTail(Plan):
     def with_tail(self, events: FloatArray, steady: FloatArray, part_ns: float) -> FloatArray:
         """Return mean events, including delayed ones.
 
-        Parameters
-        ----------
-        events : ndarray, shape (..., time)
-            Mean events in parts of bins.
-        steady : ndarray, shape (..., 1)
-            Mean events by background and dark current alone, which were there long before the record.
-        part_ns : float
-            Part width [ns].
+        `events`, shape (..., time): mean events in parts of bins. `steady`, shape (..., 1): mean events by background
+        and dark current alone, which were there long before the record. `part_ns`: part width [ns].
         """
         from scipy.signal import lfilter
 

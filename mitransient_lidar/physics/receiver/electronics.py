@@ -176,14 +176,10 @@ class Amplifier(Plan):
     def noise(self, bin_width_ns: float, stride: int = 1) -> tuple[float, FloatArray]:
         """Return the amplifier's own noise in samples that are `stride` bins apart.
 
-        Returns
-        -------
-        deviation : float
-            Standard deviation [V]: the density's, over the noise bandwidth of the low-pass. This is pi/2 times the
-            half-power frequency for a single pole and sqrt(pi/ln 16) times it for a Gaussian, or without a low-pass
-            half the inverse bin width.
-        weights : ndarray
-            Weights, with unit sum of squares, that give independent normal numbers the samples' correlation.
+        Returns `deviation`: standard deviation [V]: the density's, over the noise bandwidth of the low-pass. This is
+        pi/2 times the half-power frequency for a single pole and sqrt(pi/ln 16) times it for a Gaussian, or without a
+        low-pass half the inverse bin width. `weights`: weights, with unit sum of squares, that give independent normal
+        numbers the samples' correlation.
         """
         density = (1e-12 * self.noise_pa_per_rthz) ** 2
         if self.load_ohm is not None:

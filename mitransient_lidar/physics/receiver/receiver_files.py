@@ -180,10 +180,7 @@ def receiver(
 ) -> ReceiverChannels | Camera:
     """Return a receiver: a preset, a camera or an instrument's receiver by name, or one from a TOML file.
 
-    Raises
-    ------
-    UserError
-        If none has that name, or the file is invalid.
+    Raises `UserError` if none has that name, or the file is invalid.
     """
     if isinstance(name, (ReceiverChannels, Camera)):
         return name

@@ -45,23 +45,11 @@ def sample_moments(
 
     Raises UserError if a number is out of range, or shapes disagree.
 
-    Parameters
-    ----------
-    chain : ReceiverChain
-        The receiver.
-    power : ndarray, shape (time,)
-        Mean optical power of the signal on the detector in each bin [W], not negative.
-    directions : ndarray, shape (direction, time)
-        Changes in the power per unit of a parameter [W/unit], of either sign.
-    bin_width_ns : float
-        Bin width [ns], positive.
-    background : float
-        Constant power added to the signal [W], not negative.
+    `chain`: the receiver. `power`, shape (time,): mean optical power of the signal on the detector in each bin [W], not
+    negative. `directions`, shape (direction, time): changes in the power per unit of a parameter [W/unit], of either
+    sign. `bin_width_ns`: bin width [ns], positive. `background`: constant power added to the signal [W], not negative.
 
-    Returns
-    -------
-    SampleMoments
-        In `ReceiverChain.units`, and per parameter unit.
+    Result: in `ReceiverChain.units`, and per parameter unit.
 
     Notes
     -----

@@ -22,16 +22,10 @@ LARGEST_NEGATIVE_SHARE = 0.005
 def cox_munk(wind_speed: float) -> tuple[float, float]:
     """Slope variances of a clean sea after Cox and Munk.
 
-    Parameters
-    ----------
-    wind_speed : float
-        Wind speed [m/s], 0 to 30. Measured between 1 and 14 m/s, at a height of 12.5 m; extrapolated linearly. The
-        difference from the wind at 10 m is below their error.
+    `wind_speed`: wind speed [m/s], 0 to 30. Measured between 1 and 14 m/s, at a height of 12.5 m; extrapolated
+    linearly. The difference from the wind at 10 m is below their error.
 
-    Returns
-    -------
-    upwind, crosswind : float
-        Slope variances [1]. At zero wind the regression gives 0.003 crosswind.
+    Returns `upwind`, `crosswind`: slope variances [1]. At zero wind the regression gives 0.003 crosswind.
 
     Notes
     -----
@@ -99,11 +93,8 @@ class GramCharlierSeries:
     def along(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Return skewness and excess kurtosis of the slope in a direction.
 
-        Parameters
-        ----------
-        x, y
-            Cosines of the direction to crosswind and to upwind, each times the slope's standard deviation in that axis
-            over its standard deviation in the direction: the squares sum to 1.
+        `x`, `y`: cosines of the direction to crosswind and to upwind, each times the slope's standard deviation in that
+        axis over its standard deviation in the direction: the squares sum to 1.
         """
         x2, y2 = x * x, y * y
         skewness = -(self.c03 * y2 + 3 * self.c21 * x2) * y
@@ -120,10 +111,7 @@ class GramCharlierSeries:
     def require_positive(self, advice: str) -> None:
         """Refuse a series whose density is negative for more than half a percent of the slopes.
 
-        Raises
-        ------
-        UserError
-            With `advice` at the end.
+        Raises `UserError` with `advice` at the end.
         """
         share = self.negative_share
         if share > LARGEST_NEGATIVE_SHARE:

@@ -69,20 +69,10 @@ def heights_in_metres(
     Raises UserError if the unit is unknown, contradicts the file's, or is not stated beside positions that are not in
     metres; or heights are beyond 12 000 m, or look like a value for no data.
 
-    Parameters
-    ----------
-    path : Path
-        Their file, for messages.
-    values : ndarray
-        Values as in the file, NaN where they are declared to be missing.
-    stated : Stated
-        Statements of the file about them.
-    sign : {'heights', 'depths'}, optional
-        Whether they are positive up or down. Default: as the file states, or up.
-    unit : str, optional
-        Their unit, where the file does not state it. Default: metres.
-    no_data : float, optional
-        Value without a height, which the file does not declare.
+    `path`: their file, for messages. `values`: values as in the file, NaN where they are declared to be missing.
+    `stated`: statements of the file about them. `sign`, 'heights' or 'depths': whether they are positive up or down.
+    Default: as the file states, or up. `unit`: their unit, where the file does not state it. Default: metres.
+    `no_data`: value without a height, which the file does not declare.
     """
     if sign not in (None, "heights", "depths"):
         raise UserError(f"map_values = {sign!r} must be heights or depths")
@@ -231,12 +221,8 @@ def read_points(path: Path) -> tuple[FloatArray, Stated]:
     Raises UserError as `read_long_table`; or if columns are missing, ambiguous, in an unknown unit, or angles; x and y
     have different units; or a position is not finite.
 
-    Returns
-    -------
-    points : ndarray, shape (points, 3)
-        x, y and z as in the file; z is NaN where it is missing.
-    stated : Stated
-        Units that the heading states, and whether z is called depth.
+    Returns `points`, shape (points, 3): x, y and z as in the file; z is NaN where it is missing. `stated`: units that
+    the heading states, and whether z is called depth.
     """
 
     def choose(names: list[str]) -> list[tuple[int, Heading]]:

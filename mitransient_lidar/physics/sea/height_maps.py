@@ -62,15 +62,10 @@ class HeightMap:
     def sample(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """Return the elevation on grid lines by bilinear interpolation.
 
-        Parameters
-        ----------
-        x, y : array_like, shapes (N,) and (M,)
-            Grid line positions [m]. A point outside the map has the height of the nearest edge point.
+        `x`, `y`, shapes (N,) and (M,): grid line positions [m]. A point outside the map has the height of the nearest
+        edge point.
 
-        Returns
-        -------
-        ndarray, shape (M, N)
-            Elevation [m] at (x[i], y[j]) for element [j, i].
+        Result, shape (M, N): elevation [m] at (x[i], y[j]) for element [j, i].
         """
         (i, right), (j, up) = _cells(self.x, x), _cells(self.y, y)
         columns = self.heights[:, i] * (1 - right) + self.heights[:, i + 1] * right

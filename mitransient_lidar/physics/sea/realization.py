@@ -80,21 +80,11 @@ def wave_coefficients(
     Returns complex wave amplitudes [m] at `wave_numbers`; the other half plane is their conjugate. The constant and the
     Nyquist wavenumbers have amplitude 0.
 
-    Parameters
-    ----------
-    spectrum : WaveSpectrum or SeaState
-        Waves to realise. They travel towards the half plane of their direction.
-    period : float
-        Patch side [m], positive. Longer waves are missing.
-    cells : int
-        Cells per side, even, at least 2.
-    seed : int
-        Any integer. A wave depends only on its wavenumber and the seed: with the same period, a coarser realisation
-        equals the finer one without its short waves.
-    motion : Motion
-        Time, depth and current; equal seeds are the same sea at different times.
-    only : int, optional
-        Number of the one wave system to realise, by default all.
+    `spectrum`: waves to realise. They travel towards the half plane of their direction. `period`: patch side [m],
+    positive. Longer waves are missing. `cells`: cells per side, even, at least 2. `seed`: any integer. A wave depends
+    only on its wavenumber and the seed: with the same period, a coarser realisation equals the finer one without its
+    short waves. `motion`: time, depth and current; equal seeds are the same sea at different times. `only`: number of
+    the one wave system to realise, by default all.
     """
     ix, iy, dk = wave_numbers(period, cells)
     time = motion.time
@@ -180,12 +170,8 @@ def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
 
     `period`, `cells`: as for `wave_coefficients`.
 
-    Returns
-    -------
-    ix, iy
-        Column and row indices of a real FFT, shapes (cells/2 + 1,) and (cells,).
-    dk
-        Wavenumber of one wavelength over the period [rad/m].
+    Returns `ix`, `iy`: column and row indices of a real FFT, shapes (cells/2 + 1,) and (cells,). `dk`: wavenumber of
+    one wavelength over the period [rad/m].
     """
     positive("period", period)
     if cells != int(cells) or cells < 2 or cells % 2:
@@ -381,24 +367,12 @@ def realise_heights(
     Returns the elevations, the cell side [m], and the expected slope variances [1] of the facets along and across the
     axis.
 
-    Parameters
-    ----------
-    spectrum, seed
-        As for `wave_coefficients`.
-    period
-        Sea period [m], positive.
-    cell
-        Largest cell side [m], positive.
-    motion
-        Time, depth and current.
-    axis
-        Axis of the slope variances [rad], counter-clockwise from +x; None for variances of 0, in less time.
-    shortest_wave
-        Wavelength of the shortest waves [m]; shorter than two cells, the waves end there.
-    wavenumbers
-        Band wavenumbers [rad/m], increasing, by which the waves are also divided; by default not divided. A band's
-        share in a wave is a linear function of the logarithm of its wavenumber between neighbouring ones. Swell is the
-        last band, on its own.
+    `spectrum`, `seed`: as for `wave_coefficients`. `period`: sea period [m], positive. `cell`: largest cell side [m],
+    positive. `motion`: time, depth and current. `axis`: axis of the slope variances [rad], counter-clockwise from +x;
+    None for variances of 0, in less time. `shortest_wave`: wavelength of the shortest waves [m]; shorter than two
+    cells, the waves end there. `wavenumbers`: band wavenumbers [rad/m], increasing, by which the waves are also
+    divided; by default not divided. A band's share in a wave is a linear function of the logarithm of its wavenumber
+    between neighbouring ones. Swell is the last band, on its own.
     """
 
     def grid_of_waves(part: float) -> int:

@@ -38,10 +38,7 @@ def grid_indices(cells: int, extent: int, growth: float = _GROWTH, meshes: int =
     `growth`: ratio between the lengths of neighbouring cells outside the patch, above 1. `meshes`: number of such
     meshes made at a time.
 
-    Returns
-    -------
-    ndarray of int
-        Symmetric about 0, one apart inside the patch; integers, so that all heights are points of the fine grid.
+    Result: symmetric about 0, one apart inside the patch; integers, so that all heights are points of the fine grid.
     """
     outer, step, end = [], 1.0, cells // 2
     while end < extent / 2:
@@ -183,13 +180,9 @@ class Resolution:
 
         Raises UserError if a value is not positive or out of range.
 
-        Parameters
-        ----------
-        read
-            Parameter reader.
-        footprints
-            Footprints of the lasers and receivers above the sea. Values of the parameters ``altitude``,
-            ``off_nadir_deg``, ``divergence_mrad`` (or another definition) and ``field_of_view_mrad`` replace theirs.
+        `read`: parameter reader. `footprints`: footprints of the lasers and receivers above the sea. Values of the
+        parameters ``altitude``, ``off_nadir_deg``, ``divergence_mrad`` (or another definition) and
+        ``field_of_view_mrad`` replace theirs.
         """
         names = ("cell_size", "refined_size", "size", "shortest_wave")
         cell, side, size, wave = (None if value == AUTO else value for value in map(read, names))

@@ -114,16 +114,9 @@ class SeaSurface:
 
         Raises UserError if a parameter is out of range, or a file cannot be read.
 
-        Parameters
-        ----------
-        read
-            Parameter reader.
-        footprints
-            Footprints of the lasers and receivers above the sea, for its automatic values.
-        is_placeholder
-            Whether to check the parameters only, and return a sea without waves.
-        depths
-            Depths that waves shall follow (see `followed_depths`), None for deep water.
+        `read`: parameter reader. `footprints`: footprints of the lasers and receivers above the sea, for its automatic
+        values. `is_placeholder`: whether to check the parameters only, and return a sea without waves. `depths`: depths
+        that waves shall follow (see `followed_depths`), None for deep water.
         """
         spectrum, wind_speed = read("spectrum"), read("wind_speed")
         wind_speed = wind_speed if wind_speed >= _CALM else 0.0
@@ -261,21 +254,10 @@ class SeaSurface:
         The patches lie side by side on a square lattice about the origin, each surrounded by cells that grow out to
         `_SIZE_OF_PATCH` or the sea's size.
 
-        Parameters
-        ----------
-        places
-            Sea locations (x, y) [m], shape (n, 2).
-        refined_size
-            Side of each fine patch [m].
-        seas
-            The sea at each location's time.
+        `places`: sea locations (x, y) [m], shape (n, 2). `refined_size`: side of each fine patch [m]. `seas`: the sea
+        at each location's time.
 
-        Returns
-        -------
-        mesh : SeaMesh
-            All patches.
-        positions : ndarray
-            Positions (x, y) of the locations in it [m], shape (n, 2).
+        Returns `mesh`: all patches. `positions`: positions (x, y) of the locations in it [m], shape (n, 2).
         """
         cells = max(2, 2 * math.ceil(0.5 * refined_size / self.cell_size))
         size = max(refined_size, min(self.size, max(_SIZE_OF_PATCH, 2 * refined_size)))

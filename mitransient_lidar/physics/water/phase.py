@@ -77,19 +77,10 @@ _BISECTIONS = 52
 def fournier_forand(theta: ArrayLike, n: float, mu: float) -> FloatArray:
     """Fournier-Forand phase function.
 
-    Parameters
-    ----------
-    theta : array_like
-        Scattering angle [rad], 0 to pi.
-    n : float
-        Real refractive index of the particles relative to water, above 1.
-    mu : float
-        Slope of the hyperbolic (Junge) size distribution, 3 < mu < 5.
+    `theta`: scattering angle [rad], 0 to pi. `n`: real refractive index of the particles relative to water, above 1.
+    `mu`: slope of the hyperbolic (Junge) size distribution, 3 < mu < 5.
 
-    Returns
-    -------
-    ndarray
-        Phase function [1/sr], in the shape of `theta`; infinite at theta = 0.
+    Result: phase function [1/sr], in the shape of `theta`; infinite at theta = 0.
 
     Notes
     -----
@@ -143,10 +134,7 @@ def fournier_forand_parameters(backscatter_ratio: float) -> tuple[float, float]:
 
     `backscatter_ratio`: bb/b, from 3.4e-8 to 0.4999, the range of slopes mu from 3.0001 to 4.9999.
 
-    Returns
-    -------
-    n, mu : float
-        Parameters for `fournier_forand`, on the line n = 1.01 + 0.1542 (mu - 3).
+    Returns `n`, `mu`: parameters for `fournier_forand`, on the line n = 1.01 + 0.1542 (mu - 3).
 
     Notes
     -----

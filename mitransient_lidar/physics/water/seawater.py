@@ -38,19 +38,10 @@ _RESONANCES = (
 def refractive_index(wavelength_nm: ArrayLike, temperature: ArrayLike = 20.0, salinity: ArrayLike = 35.0) -> FloatArray:
     """Refractive index of sea water relative to air.
 
-    Parameters
-    ----------
-    wavelength_nm : array_like
-        Wavelength [nm], 400 to 1100.
-    temperature : array_like
-        Temperature [degrees C], 0 to 30.
-    salinity : array_like
-        Salinity [per mille], 0 to 40.
+    `wavelength_nm`: wavelength [nm], 400 to 1100. `temperature`: temperature [degrees C], 0 to 30. `salinity`: salinity
+    [per mille], 0 to 40.
 
-    Returns
-    -------
-    ndarray
-        Index [1], in the broadcast shape.
+    Result: index [1], in the broadcast shape.
 
     Notes
     -----
@@ -69,16 +60,10 @@ def refractive_index(wavelength_nm: ArrayLike, temperature: ArrayLike = 20.0, sa
 def group_index(wavelength_nm: ArrayLike, temperature: ArrayLike = 20.0, salinity: ArrayLike = 35.0) -> FloatArray:
     """Group index of sea water relative to air, which determines travel times.
 
-    Parameters
-    ----------
-    wavelength_nm, temperature, salinity : array_like
-        As in `refractive_index`.
+    `wavelength_nm`, `temperature`, `salinity`: as in `refractive_index`.
 
-    Returns
-    -------
-    ndarray
-        n - wavelength dn/dwavelength [1], in the broadcast shape, with the derivative of the same formulas. Travel
-        times are too short by 0.03 % in all media alike, since air has the index 1 here.
+    Result: n - wavelength dn/dwavelength [1], in the broadcast shape, with the derivative of the same formulas. Travel
+    times are too short by 0.03 % in all media alike, since air has the index 1 here.
     """
     lam, t, s = _state(wavelength_nm, temperature, salinity)
     visible = _quan_fry(lam, t, s) - lam * _quan_fry_slope(lam, t, s)

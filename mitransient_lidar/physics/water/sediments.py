@@ -142,19 +142,11 @@ def bottom_reflectance(name: str, value: object, wavelength_nm: float = 532.0) -
 
     Raises UserError if the value is none of these, or a number lies outside its range.
 
-    Parameters
-    ----------
-    name
-        Name of the parameter, for messages.
-    value
-        Number from 0 to 1, or its text, or one of `BOTTOMS`.
-    wavelength_nm
-        Wavelength for a bottom by name [nm], 400 to 700 for coral sand and algae, 400 to 1100 for the others.
+    `name`: name of the parameter, for messages. `value`: number from 0 to 1, or its text, or one of `BOTTOMS`.
+    `wavelength_nm`: wavelength for a bottom by name [nm], 400 to 700 for coral sand and algae, 400 to 1100 for the
+    others.
 
-    Returns
-    -------
-    float
-        Reflectance, 0 to 1; for a name linear between the values of the table, 10 nm apart.
+    Result: reflectance, 0 to 1; for a name linear between the values of the table, 10 nm apart.
 
     Notes
     -----

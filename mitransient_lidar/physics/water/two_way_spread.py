@@ -61,18 +61,9 @@ class TwoWaySpread:
     ) -> TwoWaySpread:
         """Draw paths, the same ones for the same arguments.
 
-        Parameters
-        ----------
-        column, phases
-            Layers of water, and the phase function of each.
-        depths
-            Depths [m], increasing, positive, shape (depths,).
-        cos_water
-            Cosine of the axis in the water from the vertical, above 0 to 1.
-        paths
-            Number of paths for each depth.
-        seed
-            Seed of the random numbers.
+        `column`, `phases`: layers of water, and the phase function of each. `depths`: depths [m], increasing, positive,
+        shape (depths,). `cos_water`: cosine of the axis in the water from the vertical, above 0 to 1. `paths`: number
+        of paths for each depth. `seed`: seed of the random numbers.
         """
         rng = np.random.default_rng(seed)
         ways = _Ways(column, phases, depths, cos_water, _WAYS * paths, rng)
@@ -116,16 +107,10 @@ class TwoWaySpread:
 class _Ways:
     """Ways down from the surface along a tilted axis, all with an event above the last depth.
 
-    Attributes
-    ----------
-    share
-        Share of the light that meets an event above the last depth.
-    unscattered
-        Share of the light that has met none at each depth, shape (depths,).
-    values
-        Displacement x, y [m], excess length [m], excess absorption, direction x, y, z and number of events of ways at
-        each depth, shape (depths, 8, ways + 1). The number is 0 for ways that go up before it, and the last way is
-        straight.
+    `share`: share of the light that meets an event above the last depth. `unscattered`: share of the light that has met
+    none at each depth, shape (depths,). `values`: displacement x, y [m], excess length [m], excess absorption,
+    direction x, y, z and number of events of ways at each depth, shape (depths, 8, ways + 1). The number is 0 for ways
+    that go up before it, and the last way is straight.
     """
 
     def __init__(
@@ -241,24 +226,11 @@ def displacements(
 ) -> np.ndarray:
     """Return displacements at depths by 0, 1, ... forward scattering events on a vertical way, as complex numbers [m].
 
-    Parameters
-    ----------
-    column, phases
-        Water layers, and the phase function of each.
-    depths
-        Depths [m], shape (depths,), positive.
-    most
-        Largest number of events.
-    count
-        Number of samples.
-    rng
-        Random numbers.
+    `column`, `phases`: water layers, and the phase function of each. `depths`: depths [m], shape (depths,), positive.
+    `most`: largest number of events. `count`: number of samples. `rng`: random numbers.
 
-    Returns
-    -------
-    ndarray
-        Shape (depths, most + 1, count). Events are at random optical depths of scattering. Angles above 80 degrees move
-        light out of any beam.
+    Result: shape (depths, most + 1, count). Events are at random optical depths of scattering. Angles above 80 degrees
+    move light out of any beam.
     """
     found = np.zeros((depths.size, most + 1, count), np.complex128)
     tops = np.append(column.layer_tops, np.inf)

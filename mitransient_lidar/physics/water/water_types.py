@@ -137,17 +137,10 @@ def pure_seawater(
 def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
     """Water with one of Jerlov's optical types at 532 nm, with Jerlov's Kd.
 
-    Parameters
-    ----------
-    water_type : str
-        I, IA, IB, II or III in the open ocean, 1C, 3C, 5C, 7C or 9C at the coast.
-    wavelength_nm : float
-        Wavelength [nm], 531 to 533: the table is for 532 nm only.
+    `water_type`: I, IA, IB, II or III in the open ocean, 1C, 3C, 5C, 7C or 9C at the coast. `wavelength_nm`: wavelength
+    [nm], 531 to 533: the table is for 532 nm only.
 
-    Raises
-    ------
-    UserError
-        If there is no such type.
+    Raises `UserError` if there is no such type.
 
     Notes
     -----
@@ -184,12 +177,7 @@ def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
 def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentProperties:
     """Case 1 water (open ocean), whose particles and dissolved matter covary with chlorophyll.
 
-    Parameters
-    ----------
-    concentration : float
-        Chlorophyll concentration C [mg/m^3], 0.01 to 30.
-    wavelength_nm : float
-        Wavelength [nm], 400 to 700.
+    `concentration`: chlorophyll concentration C [mg/m^3], 0.01 to 30. `wavelength_nm`: wavelength [nm], 400 to 700.
 
     Notes
     -----
@@ -323,21 +311,12 @@ def water_of(
 ) -> InherentProperties:
     """Return a water's inherent optical properties.
 
-    Parameters
-    ----------
-    kind
-        ``jerlov``, ``chlorophyll``, ``kd``, ``secchi``, ``petzold`` or ``pure``.
-    value
-        Jerlov's type (``I`` to ``9C``), chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m] or Petzold's ``clear``,
-        ``coastal`` or ``turbid``; None for pure sea water.
-    wavelength_nm, temperature, salinity
-        Wavelength [nm], temperature [deg C] and salinity [per mille]. Above 700 nm, `near_infrared` takes a water with
-        particles there from 532 nm.
+    `kind`: ``jerlov``, ``chlorophyll``, ``kd``, ``secchi``, ``petzold`` or ``pure``. `value`: Jerlov's type (``I`` to
+    ``9C``), chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m] or Petzold's ``clear``, ``coastal`` or ``turbid``; None
+    for pure sea water. `wavelength_nm`, `temperature`, `salinity`: wavelength [nm], temperature [deg C] and salinity
+    [per mille]. Above 700 nm, `near_infrared` takes a water with particles there from 532 nm.
 
-    Raises
-    ------
-    UserError
-        If the kind is unknown, or a value is missing, not a number or out of range.
+    Raises `UserError` if the kind is unknown, or a value is missing, not a number or out of range.
     """
     if kind not in WATER_KINDS:
         raise UserError(f"kind = {kind!r} must be one of {', '.join(WATER_KINDS)}")

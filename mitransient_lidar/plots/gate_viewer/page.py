@@ -136,23 +136,15 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
     Raises UserError if `stack` has neither gates nor a record in time, `result` has other pixels, or `limit_mb` is not
     above 0 or too small for the gates of one block (of all pixels, if they form no image).
 
-    Parameters
-    ----------
-    stack : xarray.Dataset
-        A result with ``waveform`` [W], or a record with ``signal``, over (pixel, time) or (row, column, time); the map
-        shows one of its time bins. For a shot series, the page shows the mean. Pixels with outlines
-        (``pixel_outlines``) have their shapes.
-
-        Or camera frames, whose mean above the dark level the page shows, or a gate stack: ``gate_energy`` and
-        ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the coordinates ``gate_start`` and
-        ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the surface echo time is known, ``gate_depth``
-        [m]. With a result's lines of sight, pixel depths are along them; gate and time depths are on the receiver's
-        axis.
-    result : xarray.Dataset, optional
-        A render of the same pixels, whose ``waveform`` [W] is plotted; by default `stack` itself. Without waveforms a
-        pixel's record is its energy in the gates.
-    limit_mb : float
-        Largest page size [MB of 1e6 bytes], above 0.
+    `stack`: a result with ``waveform`` [W], or a record with ``signal``, over (pixel, time) or (row, column, time); the
+    map shows one of its time bins. For a shot series, the page shows the mean. Pixels with outlines
+    (``pixel_outlines``) have their shapes. Or camera frames, whose mean above the dark level the page shows, or a gate
+    stack: ``gate_energy`` and ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the
+    coordinates ``gate_start`` and ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the surface echo time
+    is known, ``gate_depth`` [m]. With a result's lines of sight, pixel depths are along them; gate and time depths are
+    on the receiver's axis. `result`: a render of the same pixels, whose ``waveform`` [W] is plotted; by default `stack`
+    itself. Without waveforms a pixel's record is its energy in the gates. `limit_mb`: largest page size [MB of 1e6
+    bytes], above 0.
     """
     positive("limit_mb", limit_mb)
     record: xr.Dataset | None

@@ -216,22 +216,10 @@ class ShotBatches:
     and the patches lie beside each other in one mesh. Solids are met at the location itself, except solids that move
     with the lidar. A bubble plume belongs to one shot: such scenes have a batch for each.
 
-    Parameters
-    ----------
-    renderer
-        Renderer for the shot at the scene's location.
-    aim
-        Location (x, y) in the scene of its own shot [m].
-    passes
-        Passes for each shot, the most with a `goal`.
-    share
-        Share of a full pass's paths.
-    goal
-        Relative standard error of a batch's median bin that ends its passes.
-    window
-        Bins that count, for a shot without land; None where none do.
-    companions
-        Solids that move with the lidar.
+    `renderer`: renderer for the shot at the scene's location. `aim`: location (x, y) in the scene of its own shot [m].
+    `passes`: passes for each shot, the most with a `goal`. `share`: share of a full pass's paths. `goal`: relative
+    standard error of a batch's median bin that ends its passes. `window`: bins that count, for a shot without land;
+    None where none do. `companions`: solids that move with the lidar.
     """
 
     def __init__(

@@ -42,16 +42,9 @@ def pilot_sea(sea: SeaSurface | None, count: int) -> tuple[FloatArray, FloatArra
 def pilots_over(loaded: ShotScene, depth: FloatArray, bottom: float, first_seed: int) -> xr.Dataset:
     """Return pilot shots' light over a flat bottom.
 
-    Parameters
-    ----------
-    loaded
-        The scene, for light by maps or by merging.
-    depth
-        Bottom depths below each shot [m], at most `bottom`, shape (PILOTS,); without effect on merged light.
-    bottom
-        Depth of the scene's bottom [m].
-    first_seed
-        The first shot's seed.
+    `loaded`: the scene, for light by maps or by merging. `depth`: bottom depths below each shot [m], at most `bottom`,
+    shape (PILOTS,); without effect on merged light. `bottom`: depth of the scene's bottom [m]. `first_seed`: the first
+    shot's seed.
     """
     from mitransient_lidar.rendering.shots.batches import ShotPoses, share_for_error
     from mitransient_lidar.rendering.shots.truth import sea_of

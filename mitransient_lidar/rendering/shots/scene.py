@@ -34,22 +34,11 @@ AIM, TARGET = ("aim_x", "aim_y"), ("target_x", "target_y")
 class ShotScene:
     """The scene for a shot series, at the first one's location; its time bins are reported, and it is checked.
 
-    Parameters
-    ----------
-    scene, params, instrument, sensor
-        As for `loading.scenes.open_scene`, with the parameters ``aim_x`` and ``aim_y``.
-    places
-        Shot locations [m], shape (shots, 2).
-    target
-        Distance from the aim to the target [m], which moves with the shots; None if it stays.
-    axis
-        Time bins instead of automatic ones.
-    components, derivatives
-        As for `series.render_shots`.
-    check
-        Whether to tell the time bins, and to check the scene.
-    light
-        As in `series.render_shots`.
+    `scene`, `params`, `instrument`, `sensor`: as for `loading.scenes.open_scene`, with the parameters ``aim_x`` and
+    ``aim_y``. `places`: shot locations [m], shape (shots, 2). `target`: distance from the aim to the target [m], which
+    moves with the shots; None if it stays. `axis`: time bins instead of automatic ones. `components`, `derivatives`: as
+    for `series.render_shots`. `check`: whether to tell the time bins, and to check the scene. `light`: as in
+    `series.render_shots`.
     """
 
     def __init__(

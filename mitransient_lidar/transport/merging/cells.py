@@ -139,23 +139,13 @@ class WaterCells:
     goes to where its light would cross this plane along the beam, refracted and spread. Narrow beams do not blur,
     however they are refracted.
 
-    Parameters
-    ----------
-    profile
-        Beam profile, for changes between points and the plane.
-    width
-        Horizontal side of a cell on the axis at the surface, over the rings' core radius.
-    growth
-        Growth of the width with depth [1/m], as the waves' light patterns blur with depth.
-    thickness, uppermost
-        Thickness of a cell, and of the uppermost ones, which may be thinner [m]: narrow beams spread fast there.
-    depth
-        Depth within which different layers have different buckets [m].
-    bits
-        Base-2 logarithm of the number of buckets per shot.
-    view_growth, widening
-        Further growth with depth [1/m], as ripples widen the visible light, for cells that a narrow view limits at the
-        surface; and the largest width that it reaches relative to the surface.
+    `profile`: beam profile, for changes between points and the plane. `width`: horizontal side of a cell on the axis at
+    the surface, over the rings' core radius. `growth`: growth of the width with depth [1/m], as the waves' light
+    patterns blur with depth. `thickness`, `uppermost`: thickness of a cell, and of the uppermost ones, which may be
+    thinner [m]: narrow beams spread fast there. `depth`: depth within which different layers have different buckets
+    [m]. `bits`: base-2 logarithm of the number of buckets per shot. `view_growth`, `widening`: further growth with
+    depth [1/m], as ripples widen the visible light, for cells that a narrow view limits at the surface; and the largest
+    width that it reaches relative to the surface.
     """
 
     OF_SHOTS = ("heights", "rings", "_shift", "_start")

@@ -214,14 +214,9 @@ class WaterConnections:
         Path and point are drawn one after the other. Paths with other points, in a scene that differs a little, then
         change no other pairs. Partners are points on light paths, or photon numbers in a shot.
 
-        Returns
-        -------
-        lanes
-            Lanes of the pairs, which their numbers count.
-        point, partner
-            The points, and their partners' numbers.
-        weight
-            Reciprocal of the expected number of pairs with the same point and partner; 0 where one does not exist.
+        Returns `lanes`: lanes of the pairs, which their numbers count. `point`, `partner`: the points, and their
+        partners' numbers. `weight`: reciprocal of the expected number of pairs with the same point and partner; 0 where
+        one does not exist.
         """
         points = self._points
         lanes = self._shots.paths(points.paths * self.rates.per_path)

@@ -73,18 +73,9 @@ class BeamRings:
     With the core radius q, rings have equal widths in arsinh(r / q). The widths are nearly equal in the core, and
     proportional to the radius r far from it. On an obliquely lit sea rings are ellipses, as footprints are.
 
-    Parameters
-    ----------
-    pose
-        Laser pose.
-    spread
-        Beam standard deviation where its axis meets the sea, across the axis [m].
-    index
-        Refractive index of the water over that at the laser.
-    growth
-        Growth of the core radius with depth [m/m].
-    tilt
-        Mean slopes of the sea along x and y, which refracts the axis [1], shape (1, 2); by default it is level.
+    `pose`: laser pose. `spread`: beam standard deviation where its axis meets the sea, across the axis [m]. `index`:
+    refractive index of the water over that at the laser. `growth`: growth of the core radius with depth [m/m]. `tilt`:
+    mean slopes of the sea along x and y, which refracts the axis [1], shape (1, 2); by default it is level.
 
     The axis begins where it meets the mean sea level, or where each shot's beam meets the sea (`of_entries`).
     """

@@ -166,13 +166,8 @@ _SIGN, _MAGNITUDE = 1 << 31, (1 << 31) - 1  #: Sign bit of a number, and all oth
 class PackedStore:
     """Stored numbers for points, one entry per point.
 
-    Parameters
-    ----------
-    size
-        Number of entries.
-    fields
-        Stored fields, in the order of their packets with four numbers: by name a Mitsuba type, or a number list's
-        length. ``number|flag`` are a number, 0 or more, and a flag in its sign bit.
+    `size`: number of entries. `fields`: stored fields, in the order of their packets with four numbers: by name a
+    Mitsuba type, or a number list's length. ``number|flag`` are a number, 0 or more, and a flag in its sign bit.
     """
 
     def __init__(self, size: int, fields: Mapping[str, str | int]) -> None:

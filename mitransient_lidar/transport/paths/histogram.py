@@ -79,20 +79,10 @@ class TransientHistogram:
 
     Raises UserError when pixels times bins, or pixels times gates, with the perturbations exceed 2^28.
 
-    Parameters
-    ----------
-    axis
-        Time bins of the record.
-    shape
-        Numbers of pixels, (pixels,) or (rows, columns).
-    emitted
-        Energy that the laser emits [J], the most that a bin receives.
-    gates
-        Gates that are summed instead of the time bins, or None.
-    reference_length
-        Length that is left out of path lengths [m], so that they are accurate in single precision.
-    perturbations
-        Perturbations, each of which is summed as the energies are.
+    `axis`: time bins of the record. `shape`: numbers of pixels, (pixels,) or (rows, columns). `emitted`: energy that
+    the laser emits [J], the most that a bin receives. `gates`: gates that are summed instead of the time bins, or None.
+    `reference_length`: length that is left out of path lengths [m], so that they are accurate in single precision.
+    `perturbations`: perturbations, each of which is summed as the energies are.
     """
 
     #: Memory per bin, or per gate [bytes]: two sums and a mark.

@@ -47,19 +47,10 @@ class RippleFocusing:
     the ratio of the enhancements with and without correlated ripples. It depends on the echo's depth and the number of
     forward scattering events, which move one way against the other (`physics.sea.double_passage`).
 
-    Parameters
-    ----------
-    depths, factors
-        Depths [m], and factors, of shape (`_MOST_EVENTS` + 1, `_DEPTHS`).
-    depth_per_length
-        Echo depth over its path's optical length beyond the surface path.
-    enhancement
-        Enhancement by all waves, in the shape of `factors`.
-    events
-        Mean number of scattering events on both ways to each depth.
-    enhancements
-        Returns the enhancements in other water by all waves and by the drawn waves, in the shape of `factors`
-        transposed.
+    `depths`, `factors`: depths [m], and factors, of shape (`_MOST_EVENTS` + 1, `_DEPTHS`). `depth_per_length`: echo
+    depth over its path's optical length beyond the surface path. `enhancement`: enhancement by all waves, in the shape
+    of `factors`. `events`: mean number of scattering events on both ways to each depth. `enhancements`: returns the
+    enhancements in other water by all waves and by the drawn waves, in the shape of `factors` transposed.
     """
 
     def __init__(

@@ -71,19 +71,11 @@ class LayoutPixels(PixelArray):
     Points are drawn over the field of view and then assigned to pixels. The pixels thus sum, path by path, to a single
     pixel with the same field of view.
 
-    Parameters
-    ----------
-    layout
-        ``RxC``: R rows along range, row 0 the far edge (+angle_x); C columns, column 0 the left edge (+angle_y).
-        ``1x4`` is ``4x1``.
-    field_of_view
-        Diameter or side [rad], positive; of a rectangle (height along angle_x, width along angle_y).
-    shape
-        ``circle`` or ``square``; different sides make a rectangle.
-    imager
-        Whether rows and columns are separate dimensions of the result; None decides by the number of pixels.
-    fill_factor
-        Share of each cell that receives light, 0.01 to 1: a smaller rectangle about the same centre, cut by the circle.
+    `layout`: ``RxC``: R rows along range, row 0 the far edge (+angle_x); C columns, column 0 the left edge (+angle_y).
+    ``1x4`` is ``4x1``. `field_of_view`: diameter or side [rad], positive; of a rectangle (height along angle_x, width
+    along angle_y). `shape`: ``circle`` or ``square``; different sides make a rectangle. `imager`: whether rows and
+    columns are separate dimensions of the result; None decides by the number of pixels. `fill_factor`: share of each
+    cell that receives light, 0.01 to 1: a smaller rectangle about the same centre, cut by the circle.
     """
 
     sides: tuple[float, float]
