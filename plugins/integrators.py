@@ -22,9 +22,7 @@ from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses
 from mitransient_lidar.transport.paths.volpath import VolpathOptions, VolpathRenderer
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
-from mitransient_lidar.transport.sensor.receiver import (
-    Receiver,
-)
+from mitransient_lidar.transport.sensor.receiver import Receiver
 
 
 class PassIntegrator(mi.CppADIntegrator):

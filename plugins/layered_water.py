@@ -115,9 +115,7 @@ class LayeredWater(mi.Medium):
 
 
 def _read_water(
-    props: DeclaredProperties,
-    nested: dict[str, mi.PhaseFunction],
-    bubbles: mi.PhaseFunction | None,
+    props: DeclaredProperties, nested: dict[str, mi.PhaseFunction], bubbles: mi.PhaseFunction | None
 ) -> Water:
     """Return the water that parameters describe.
 

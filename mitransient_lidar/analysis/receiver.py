@@ -74,8 +74,7 @@ def detect_waveforms(
     shots: Annotated[int, Option("Records per waveform, or frames per gate, with independent noise", 1, 10**9)] = 1,
     seed: Seed = 0,
     background_power: Annotated[
-        Powers,
-        Option("Daylight power on each pixel [W] (at least 0)", flag="--background-power-w"),
+        Powers, Option("Daylight power on each pixel [W] (at least 0)", flag="--background-power-w")
     ] = 0.0,
     *,
     gain: Gain = None,

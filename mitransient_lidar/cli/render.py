@@ -114,13 +114,11 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
 def _shots(
     call: Call,
     places: Annotated[
-        Path | None,
-        Option("CSV file with shot locations, columns x and y [m], instead of random ones", form="FILE"),
+        Path | None, Option("CSV file with shot locations, columns x and y [m], instead of random ones", form="FILE")
     ] = None,
     output: Annotated[Path, Option("NetCDF file for all shots")] = OUTPUT / "shots.nc",
     figure: Annotated[
-        Path | None,
-        Option("PNG, PDF or SVG file of the echoes against the slopes; also writes these data as .nc"),
+        Path | None, Option("PNG, PDF or SVG file of the echoes against the slopes; also writes these data as .nc")
     ] = None,
     quiet: Quiet = False,
 ) -> None:

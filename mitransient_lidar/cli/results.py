@@ -44,8 +44,7 @@ def _view(
         ),
     ],
     output: Annotated[
-        Path | None,
-        Option("HTML file for the page, by default a temporary one; PNG, PDF or SVG file for a drawing"),
+        Path | None, Option("HTML file for the page, by default a temporary one; PNG, PDF or SVG file for a drawing")
     ] = None,
     browser: Annotated[bool, Option("Open the page in the browser")] = True,
     shot: Annotated[int | None, Option("Number of a shot in a series, from 0; by default their mean")] = None,

@@ -155,9 +155,7 @@ def _depth_bias(
 
 @COMMANDS.add(_SURVEY, "studies.depth_bias:tpu", "riegl_vq840g --altitudes 100,150")
 def _tpu(
-    call: Call,
-    output: Annotated[Path, Option("Folder for the files", form="DIR")] = OUTPUT,
-    quiet: Quiet = False,
+    call: Call, output: Annotated[Path, Option("Folder for the files", form="DIR")] = OUTPUT, quiet: Quiet = False
 ) -> None:
     """Determine the vertical and horizontal uncertainty of an instrument's soundings.
 

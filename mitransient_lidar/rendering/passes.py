@@ -56,8 +56,7 @@ Derivatives = Annotated[
 Batches = Annotated[
     int | None,
     Option(
-        "Also keep this many batch waveforms, from which a fit to the result takes its error correlation",
-        *(2, 256),
+        "Also keep this many batch waveforms, from which a fit to the result takes its error correlation", *(2, 256)
     ),
 ]
 Smooth = Annotated[
@@ -79,8 +78,7 @@ LightOption = Annotated[str, Option(_LIGHT, form="|".join(LIGHT))]
 Light = Annotated[
     str | None,
     Option(
-        f"{_LIGHT}; level for a first look in about a second: maps below a level sea",
-        form="|".join(LIGHT_OF_RENDERS),
+        f"{_LIGHT}; level for a first look in about a second: maps below a level sea", form="|".join(LIGHT_OF_RENDERS)
     ),
 ]
 Variant = Annotated[str | None, Option("Mitsuba variant, e.g. llvm_ad_mono")]

@@ -92,10 +92,7 @@ def label(dataset: xr.Dataset, kind: str = "", **units: str) -> xr.Dataset:
 def flagged(meanings: type[IntEnum] | type[IntFlag]) -> dict[str, Any]:
     """Return the attributes for a variable whose values, or bits in flags, are an enum's members."""
     key = "flag_masks" if issubclass(meanings, IntFlag) else "flag_values"
-    return {
-        key: [int(one) for one in meanings],
-        "flag_meanings": " ".join(str(one.name).lower() for one in meanings),
-    }
+    return {key: [int(one) for one in meanings], "flag_meanings": " ".join(str(one.name).lower() for one in meanings)}
 
 
 _POSITIVE, _NOT_NEGATIVE, _ANY, _INDEX = (1e-30, 1e30), (0.0, 1e30), (-1e30, 1e30), (1.0, 10.0)

@@ -103,8 +103,7 @@ def depth_bias(
     shots: Places = 12,
     records: Records = 5,
     target_error: Annotated[
-        float,
-        Option("Relative standard error of a render over waves; 0.6 of it over a level sea", 0, 1, above=True),
+        float, Option("Relative standard error of a render over waves; 0.6 of it over a level sea", 0, 1, above=True)
     ] = 0.05,
     corrections: Annotated[
         Given | None,

@@ -57,8 +57,7 @@ _LARGEST_RATIO = 0.1  # variance by the model's Monte Carlo over the waveform va
 def fit(
     source: xr.Dataset | str | os.PathLike[str],
     scene: Annotated[
-        str | os.PathLike[str] | Model | None,
-        Option("Name or XML file of the scene, by default the result's scene"),
+        str | os.PathLike[str] | Model | None, Option("Name or XML file of the scene, by default the result's scene")
     ] = None,
     free: Annotated[
         Sequence[str], Option("Free scene parameters, and bandwidth_mhz for a receiver", form="NAME,NAME,...")
@@ -73,8 +72,7 @@ def fit(
         Mapping[str, tuple[float, float]] | None, Option("Bounds of a free parameter. Repeatable", form="NAME=LOW:HIGH")
     ] = None,
     free_scale: Annotated[
-        bool | None,
-        Option("Fit a scale factor, by default for CSV files alone", flag="--free-scale/--fixed-scale"),
+        bool | None, Option("Fit a scale factor, by default for CSV files alone", flag="--free-scale/--fixed-scale")
     ] = None,
     free_time: Annotated[
         bool | None, Option("Fit a time offset, by default for CSV files alone", flag="--free-time/--fixed-time")

@@ -15,15 +15,7 @@ import xarray as xr
 from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.retrieval.column_retrieval import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import (
-    Instrument,
-    Numbers,
-    Option,
-    Scene,
-    Seed,
-    checked,
-    positive_option,
-)
+from mitransient_lidar.core.options import Instrument, Numbers, Option, Scene, Seed, checked, positive_option
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, integer, shown
 from mitransient_lidar.loading.catalogue import scene_path
@@ -57,8 +49,7 @@ def scattering(
     params: Mapping[str, Any] | None = None,
     *,
     orders: Annotated[
-        int | None,
-        Option("Scattering orders to separate, 8 unless depths or views are given", 1, MOST_ORDERS),
+        int | None, Option("Scattering orders to separate, 8 unless depths or views are given", 1, MOST_ORDERS)
     ] = None,
     depths: Annotated[
         Numbers | None,

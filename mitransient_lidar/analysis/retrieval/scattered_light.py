@@ -122,11 +122,7 @@ class ScatteredLight:
 
 
 def of_columns(
-    waveforms: Waveforms,
-    echoes: xr.Dataset,
-    system: LidarSystem,
-    share: FloatArray,
-    dataset: xr.Dataset,
+    waveforms: Waveforms, echoes: xr.Dataset, system: LidarSystem, share: FloatArray, dataset: xr.Dataset
 ) -> ScatteredLight | None:
     """Return the light in the water that the mean column of waveforms shows; None where no column is known.
 
@@ -166,13 +162,7 @@ def mean_of_known(values: FloatArray) -> float:
 
 
 def light_of(
-    view: View,
-    decay: float,
-    backscatter: float,
-    path: FloatArray,
-    weights: FloatArray,
-    deepest: float,
-    ratio: float,
+    view: View, decay: float, backscatter: float, path: FloatArray, weights: FloatArray, deepest: float, ratio: float
 ) -> ScatteredLight:
     """Return the light in the water whose column has an exponential.
 

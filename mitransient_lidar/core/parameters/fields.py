@@ -13,13 +13,7 @@ from typing import Any
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import (
-    FloatArray,
-    finite,
-    integer,
-    number_list,
-    number_within,
-)
+from mitransient_lidar.core.validation import FloatArray, finite, integer, number_list, number_within
 
 AUTO = "auto"  #: Text that leaves the choice of a value to the scene.
 GREEN_LASERS = (510.0, 540.0)  #: Wavelengths [nm] of lasers for which values at 532 nm stand.

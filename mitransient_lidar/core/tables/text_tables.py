@@ -318,11 +318,7 @@ def _values(
 
 
 def _invalid_line(
-    path: str | PathLike[str],
-    line: Line,
-    names: Sequence[str],
-    headings: Sequence[Heading | None],
-    column: int | None,
+    path: str | PathLike[str], line: Line, names: Sequence[str], headings: Sequence[Heading | None], column: int | None
 ) -> UserError:
     """Return the error for a line with a wrong number of cells, or with one in `column` that is no number."""
     where = f"{path}, line {line.number}"

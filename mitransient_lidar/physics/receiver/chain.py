@@ -190,11 +190,7 @@ class ReceiverChain:
         return replace(self, amplifier=replace(self.amplifier, transimpedance_ohm=ohm))
 
     def fitting_gain(
-        self,
-        power: npt.ArrayLike,
-        bin_width_ns: float,
-        background: npt.ArrayLike = 0.0,
-        samples: slice = slice(None),
+        self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0, samples: slice = slice(None)
     ) -> float:
         """Return the largest factor of the gain, at most 1, that keeps samples in range; see `with_gain`.
 
@@ -305,11 +301,7 @@ class ReceiverChain:
         return (charge * peak).reshape(np.shape(power)[:-1])
 
     def snr(
-        self,
-        power: npt.ArrayLike,
-        bin_width_ns: float,
-        background: npt.ArrayLike = 0.0,
-        lit: Expected | None = None,
+        self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0, lit: Expected | None = None
     ) -> FloatArray:
         """Return the samples' signal-to-noise ratio in one shot, shape (..., sample).
 

@@ -175,9 +175,7 @@ def _shape(amplifier: Amplifier | None) -> tuple[Any, ...] | None:
     return amplifier.bandwidth_mhz, amplifier.response, amplifier.impulse_response
 
 
-def receiver(
-    name: str | os.PathLike[str] | ReceiverChain | ReceiverChannels | Camera,
-) -> ReceiverChannels | Camera:
+def receiver(name: str | os.PathLike[str] | ReceiverChain | ReceiverChannels | Camera) -> ReceiverChannels | Camera:
     """Return a receiver: a preset, a camera or an instrument's receiver by name, or one from a TOML file.
 
     Raises `UserError` if none has that name, or the file is invalid.

@@ -35,11 +35,7 @@ class SampleMoments(NamedTuple):
 
 
 def sample_moments(
-    chain: ReceiverChain,
-    power: FloatArray,
-    directions: FloatArray,
-    bin_width_ns: float,
-    background: float = 0.0,
+    chain: ReceiverChain, power: FloatArray, directions: FloatArray, bin_width_ns: float, background: float = 0.0
 ) -> SampleMoments:
     """Return mean and covariance of one record's samples, and their derivatives.
 

@@ -305,10 +305,7 @@ class ShotBatches:
             on_sea = all_shots.on_sea
             waves = on_sea.scene_part(lidar.mitsuba_scene, on_sea.places, self._aim)
             placed = replace(
-                lidar,
-                parts=tuple(moved),
-                receiver_poses=all_shots.receiver,
-                transmitter_poses=all_shots.transmitter,
+                lidar, parts=tuple(moved), receiver_poses=all_shots.receiver, transmitter_poses=all_shots.transmitter
             )
             fields = HeightFields.of_patches(values, corners, sea.cell_size, sea.wind_direction, waves, copies)
             return renderer.over(placed, fields)

@@ -16,15 +16,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.options import (
-    Infrared,
-    Instrument,
-    Option,
-    SceneOrResult,
-    Sensor,
-    checked,
-    positive_option,
-)
+from mitransient_lidar.core.options import Infrared, Instrument, Option, SceneOrResult, Sensor, checked, positive_option
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 from mitransient_lidar.core.tables.headings import Column
 from mitransient_lidar.core.tables.text_tables import read_two_columns

@@ -83,9 +83,7 @@ def sphere(renders: Renders) -> Quantities:
     """Return the depth of the sphere at 9 m (figure 2)."""
     result = renders.shot(scenes.MINE)
     gate, geometry = echo_gate(result, 9.0), geometry_of(result)
-    return {
-        "sphere": _measured(lambda one: float(geometry.depth_of_time(one.highest(gate, "target")[1][0])), result),
-    }
+    return {"sphere": _measured(lambda one: float(geometry.depth_of_time(one.highest(gate, "target")[1][0])), result)}
 
 
 def mast(renders: Renders) -> Quantities:

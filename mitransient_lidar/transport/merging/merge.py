@@ -84,11 +84,7 @@ def merge_in_water(
 
 
 def merge_on_solids(
-    patches: SolidPatches,
-    received: ReceivedLight,
-    photons: PhotonMap | None,
-    connections: mi.Float,
-    rng: mi.PCG32,
+    patches: SolidPatches, received: ReceivedLight, photons: PhotonMap | None, connections: mi.Float, rng: mi.PCG32
 ) -> Action:
     """Return the action that merges the receiver's paths with the light on the solids that they meet.
 

@@ -83,12 +83,7 @@ class BeamRings:
     OF_SHOTS = ("_entry", "shear", "slant", "_level", "tilt")
 
     def __init__(
-        self,
-        pose: Pose,
-        spread: float,
-        index: float,
-        growth: float = _CORE_PER_METRE,
-        tilt: FloatArray | None = None,
+        self, pose: Pose, spread: float, index: float, growth: float = _CORE_PER_METRE, tilt: FloatArray | None = None
     ) -> None:
         self.spread, self._growth, self._index = opaque(spread), opaque(growth), index
         self._entry = mi.Vector3f(opaque(0.0))

@@ -12,12 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import snell
-from mitransient_lidar.physics.sea.double_passage import (
-    LEAST_DEPTH,
-    EnhancementTable,
-    slope_spread,
-    slope_structures,
-)
+from mitransient_lidar.physics.sea.double_passage import LEAST_DEPTH, EnhancementTable, slope_spread, slope_structures
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.two_way_spread import displacements
