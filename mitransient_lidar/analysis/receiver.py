@@ -163,6 +163,9 @@ def detect_waveforms(
     return recorded
 
 
+record = detect_waveforms  #: Name at the top of the package.
+
+
 def _camera_of(dataset: xr.Dataset, given: Any) -> Camera | None:
     """Return the camera that records the gates of a dataset, or None for a receiver that records its waveforms."""
     found = None if given is None else receiver_of("chain", given)
