@@ -13,7 +13,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.plants import Canopy, leaf_triangles
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh
 from mitransient_lidar.plugins.bases import DeclaredProperties, fill_mesh, register
-from mitransient_lidar.transport.medium.nested_objects import create_object
+from mitransient_lidar.transport.medium.water_phases import create_object
 
 
 @register("shape", CANOPY)

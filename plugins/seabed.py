@@ -16,7 +16,7 @@ from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, in_
 from mitransient_lidar.physics.sea.height_maps import HeightMap, map_origin, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
 from mitransient_lidar.plugins.bases import DeclaredProperties, fill_mesh, register
-from mitransient_lidar.transport.medium.nested_objects import create_object
+from mitransient_lidar.transport.medium.water_phases import create_object
 
 logger = logging.getLogger(__name__)
 

@@ -31,9 +31,8 @@ import numpy as np
 import numpy.typing as npt
 import psutil
 
-from mitransient_lidar.campaigns.runs import Array, Renderer
+from mitransient_lidar.campaigns.runs import Array, Renderer, difference, other_versions, own_versions
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store
-from mitransient_lidar.campaigns.versions import difference, other_versions, own_versions
 from mitransient_lidar.core.errors import LINES, UserError, printable, raise_if_out_of_memory
 from mitransient_lidar.core.files import open_log
 
@@ -81,7 +80,7 @@ class _End(NamedTuple):
 class Processes:
     """Processes of a campaign's shards, which `end` ends together.
 
-    `versions`: required versions, as from `versions.own_versions`; by default any. `place`: their machine, for
+    `versions`: required versions, as from `runs.own_versions`; by default any. `place`: their machine, for
     messages.
     """
 

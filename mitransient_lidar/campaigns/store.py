@@ -25,8 +25,7 @@ import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from mitransient_lidar.campaigns.design import MOST_RUNS, Column
-from mitransient_lidar.campaigns.runs import Array, Renderer
-from mitransient_lidar.campaigns.versions import own_versions
+from mitransient_lidar.campaigns.runs import Array, Renderer, own_versions
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.files import check_encodable, check_tree, sweep, temporary_beside
 from mitransient_lidar.core.validation import integer, require_memory, shown

@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Protocol
 
+from mitransient_lidar.campaigns.runs import difference, other_versions, own_versions
 from mitransient_lidar.campaigns.shard import Outcome, Processes, render_in_process
-from mitransient_lidar.campaigns.versions import difference, other_versions, own_versions
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:

@@ -46,8 +46,7 @@ from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.batches import ShotPoses
-from mitransient_lidar.rendering.shots.pilots import PILOTS, pilots_over, rendered
-from mitransient_lidar.rendering.shots.scene import ShotScene
+from mitransient_lidar.rendering.shots.scene import PILOTS, ShotScene, pilots_over, rendered
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
 from mitransient_lidar.results.attributes import label, uninterrupted

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction
+from mitransient_lidar.analysis.retrieval.surface_slope import SlopeRefraction
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, Scene, checked, positive_option
 from mitransient_lidar.core.tables.written import table_lines

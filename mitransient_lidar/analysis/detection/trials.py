@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.analysis.detection.matched_filter import delay_bound, delays
 from mitransient_lidar.analysis.detection.statistics import (
     Cases,
     area_under_curve,
+    delay_bound,
+    delays,
     exceedance,
     sample_moments,
     within_range,

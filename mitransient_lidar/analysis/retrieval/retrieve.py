@@ -23,8 +23,8 @@ from mitransient_lidar.analysis.retrieval import (
     surface_slope,
 )
 from mitransient_lidar.analysis.retrieval.bottom_errors import ReflectanceFlag, scatter, steadier
-from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain
 from mitransient_lidar.analysis.retrieval.surface_echoes import PixelMap, SeaLidar, sea_shots
+from mitransient_lidar.analysis.retrieval.surface_slope import SlopeRefraction, bottom_depth, bottom_gain
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
@@ -205,7 +205,7 @@ def bottom(dataset: xr.Dataset, slopes: xr.Dataset, *, efficiency: float | None 
     efficiencies and pulse energy are not included.
 
     A correction that is not expected to lower the variance is not applied. The slope correction is left out where
-    `slope_corrections.variances` gives no lower variance with it, and the column correction where its noise exceeds the
+    `surface_slope.variances` gives no lower variance with it, and the column correction where its noise exceeds the
     reflectance scatter over the shots. With at least 8 shots, a correction that increases the reflectance scatter is
     not applied to any, as focusing by waves may have the opposite effect. With fewer shots their scatter is not known.
     """

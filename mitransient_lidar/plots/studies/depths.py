@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
 from mitransient_lidar.plots import drawing, palette
-from mitransient_lidar.plots.studies.panels import finish, name_sides, new_panels
+from mitransient_lidar.plots.drawing import finish, name_sides, new_panels
 
 #: Colours for the orders from the strictest on, for none, and for an unknown depth.
 _ORDER_COLOURS = (*palette.ordered(5), "0.9")

@@ -17,7 +17,7 @@ from matplotlib.patheffects import withStroke
 from mitransient_lidar.analysis.retrieval.retrieval_table import estimates, truth_statistics
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import drawing, palette
-from mitransient_lidar.plots.studies.panels import finish
+from mitransient_lidar.plots.drawing import finish
 from mitransient_lidar.rendering.shots.truth import Shot
 from mitransient_lidar.studies.shots import RenderedShots, depth_bias, slope_correlations, slope_effects
 
