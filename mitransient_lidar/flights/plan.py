@@ -200,11 +200,8 @@ class FlightPlan(Plan):
     def poses(self) -> PulsePoses:
         """Return the lines of sight of all rendered pulses, in the scene frame.
 
-        Raises
-        ------
-        UserError
-            For a platform, a scanner or a mounting that is invalid, a platform in other coordinates than the points,
-            and too many pulses.
+        Raises `UserError` for a platform, a scanner or a mounting that is invalid, a platform in other coordinates than
+        the points, and too many pulses.
         """
         platform = self._platform
         trajectory = platform.trajectory(self.folder)

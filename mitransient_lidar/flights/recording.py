@@ -65,12 +65,8 @@ def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray, passes: IntArray
     With fewer than four passes, all such shots together give the relative error over the 21 bins, larger beside their
     echo. A bin's own error then does not count.
 
-    Parameters
-    ----------
-    waveform, stderr
-        Mean power and its standard error, with the dimensions shot, pixel and time.
-    passes
-        Passes of each shot, shape (shots,).
+    `waveform`, `stderr`: mean power and its standard error, with the dimensions shot, pixel and time. `passes`: passes
+    of each shot, shape (shots,).
     """
     power, error = (values.transpose("shot", "pixel", "time").values for values in (waveform, stderr))
     # A mean over bins, since one that is low by chance is so in both.

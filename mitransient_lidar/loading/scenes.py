@@ -94,16 +94,28 @@ def open_scene(
 ) -> LoadedScene:
     """Load a scene.
 
-    `scene`: name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or a scene
-    source. A `LoadedScene` is returned unchanged, without `params` and `sensor`. `params`: values for the parameters of
-    an XML scene, its own (``<default>``) and its plugins', as in `loading.parameters.fill`, and of the instrument.
-    `instrument`: name of the instrument whose laser and receiver replace an XML scene's; see `catalogue.mount`.
-    `variant`: Mitsuba variant, as for `variants.set_variant`. `model`: loaded scene whose lasers and receivers choose
-    the automatic values of the sea, by default the scene itself. `sensor`: id of a receiver, by default the source's,
-    or the first one.
+    Parameters
+    ----------
+    scene
+        Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or a scene source.
+        A `LoadedScene` is returned unchanged, without `params` and `sensor`.
+    params
+        Values for the parameters of an XML scene, its own (``<default>``) and its plugins', as in
+        `loading.parameters.fill`, and of the instrument.
+    instrument
+        Name of the instrument whose laser and receiver replace an XML scene's; see `catalogue.mount`.
+    variant
+        Mitsuba variant, as for `variants.set_variant`.
+    model
+        Loaded scene whose lasers and receivers choose the automatic values of the sea, by default the scene itself.
+    sensor
+        Id of a receiver, by default the source's, or the first one.
 
-    Raises `UserError` if there is no such scene, instrument or receiver; a parameter is unknown, not used or empty; a
-    value is invalid; a part is missing; or a source file is missing or has changed.
+    Raises
+    ------
+    UserError
+        If there is no such scene, instrument or receiver; a parameter is unknown, not used or empty; a value is
+        invalid; a part is missing; or a source file is missing or has changed.
     """
     if isinstance(scene, LoadedScene) and not params and not sensor:
         return scene

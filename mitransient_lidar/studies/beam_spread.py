@@ -64,8 +64,6 @@ def beam_spread(
     standard error over the passes, ``..._stderr``. Without light, all but the first two are NaN. Raises `UserError` if
     the scene is invalid or has no water, or a number is out of range.
 
-    Notes
-    -----
     Light that has not met a solid counts each time that it passes the plane downwards: the result is the downward plane
     irradiance integrated over the plane. Light outside the surface mesh is excluded; its share of the energy is the
     attribute ``beam_outside_surface``.

@@ -221,8 +221,6 @@ def fov_sweep(
     the scene is invalid, has no water, bubbles, or several layers between the depths, a solid's echo can overlap with
     them, a number is out of range, or as for `ColumnBins`.
 
-    Notes
-    -----
     Gordon (1982), Appl. Opt. 21, 2996, doi:10.1364/AO.21.002996: for a narrow beam, K is c for c R_s far below 1, and
     falls to the diffuse attenuation at c R_s above 5 to 6. The signal depends on the correlation between the profiles
     of beam and field of view, so that both widths have the same effect. R = sqrt(R_s^2 + R_b^2) is the radius of a disc

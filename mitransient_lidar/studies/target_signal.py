@@ -63,8 +63,6 @@ def target_signal(
     is invalid, there is no such shape, or it is above the sea or below the bottom. With `is_lit`, if the sum of the
     pixels' echoes is not positive: it returns no light, or too little for these passes.
 
-    Notes
-    -----
     Where backscatter limits detection, a pixel's noise variance is proportional to the backscatter energy B. With
     echoes E and weights w, the signal-to-noise ratio is proportional to the ``detectability`` sum(w E) / sqrt(sum(w^2
     B)) [sqrt(J)], which is largest for w = E/B (matched filter): sqrt(sum(E^2/B)). Ratios of detectabilities are ratios

@@ -72,34 +72,24 @@ def fisher_information(
     Raises `UserError` if a dataset has no derivatives, renders differ, no sample has both signal and noise, a nuisance
     is unknown, or as for `detect_waveforms`.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset or sequence of xarray.Dataset
-        Results of `render` with derivatives: ``waveform`` [W] over (pixel, time) or (row, column, time), and
-        ``waveform_derivative`` [W per unit of the parameter] over parameter and the same dimensions. Several are
-        independent renders of one scene, whose noise then does not count as information.
-    chain, background_power, gain, optical_density
-        As for `analysis.receiver.detect_waveforms`.
-    nuisances : mapping of str to float, optional
-        Unknown quantities besides the parameters, with the standard deviation to which each is known, above 0 and
-        infinite for not at all: ``time_offset`` [ns] in all pixels and ``scale`` [1] of the laser light.
+    `dataset`: results of `render` with derivatives: ``waveform`` [W] over (pixel, time) or (row, column, time), and
+    ``waveform_derivative`` [W per unit of the parameter] over parameter and the same dimensions. Several are
+    independent renders of one scene, whose noise then does not count as information. `chain`, `background_power`,
+    `gain`, `optical_density`: as for `analysis.receiver.detect_waveforms`. `nuisances`: unknown quantities besides the
+    parameters, with the standard deviation to which each is known, above 0 and infinite for not at all: ``time_offset``
+    [ns] in all pixels and ``scale`` [1] of the laser light.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``parameter``, the derivatives' parameters and then the nuisances: ``bound``, the smallest standard
-        deviation of an unbiased estimate from one shot with all parameters unknown, in the parameter's unit.
-        ``bound_stderr`` is its error by render noise (NaN for less than three renders), and ``bound_known`` the bound
-        with all others known. ``variance_share`` is the share of the information that is in the sample variance.
-        ``monte_carlo_share`` is the addition by the noise of all renders together, relative to the information (see
-        Notes). Over (parameter, other_parameter): ``information`` and ``correlation`` of the estimates. Over (render,
-        parameter), from three renders on: ``bound_left_out``, without one of the renders. Per pixel ``lost_samples``,
-        the share of samples that saturate. Coordinates ``parameter_value``, ``parameter_units``, ``parameter_method``
-        and ``prior`` (a nuisance's standard deviation, infinite elsewhere). The attribute ``remarks`` has sentences on
-        parameters that the record does not determine, one per line.
+    Result: over ``parameter``, the derivatives' parameters and then the nuisances: ``bound``, the smallest standard
+    deviation of an unbiased estimate from one shot with all parameters unknown, in the parameter's unit.
+    ``bound_stderr`` is its error by render noise (NaN for less than three renders), and ``bound_known`` the bound with
+    all others known. ``variance_share`` is the share of the information that is in the sample variance.
+    ``monte_carlo_share`` is the addition by the noise of all renders together, relative to the information (see below).
+    Over (parameter, other_parameter): ``information`` and ``correlation`` of the estimates. Over (render, parameter),
+    from three renders on: ``bound_left_out``, without one of the renders. Per pixel ``lost_samples``, the share of
+    samples that saturate. Coordinates ``parameter_value``, ``parameter_units``, ``parameter_method`` and ``prior`` (a
+    nuisance's standard deviation, infinite elsewhere). The attribute ``remarks`` has sentences on parameters that the
+    record does not determine, one per line.
 
-    Notes
-    -----
     For normal samples of mean m and covariance C, with derivatives m_a and C_a by the parameter a,
 
         F_ab = m_a C^-1 m_b + tr(C^-1 C_a C^-1 C_b)/2

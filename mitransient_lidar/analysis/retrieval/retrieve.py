@@ -58,35 +58,21 @@ def surface_slopes(
 
     Raises `UserError` if the dataset lacks pixels, a coordinate or an attribute, or a number is out of range.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Waveforms of at least two pixels.
-    wind_speed : float, optional
-        Wind speed [m/s], 1 to 30, whose sea gives the prior. By default, the scene's if its sea has the Elfouhaily
-        spectrum and the Cox and Munk slopes.
-    wind_direction_deg : float, optional
-        Direction that the wind blows towards, counter-clockwise from +x [degree]. By default, the scene's, or +x.
-    slope_deviation : (float, float), optional
-        Prior for an unknown sea instead: standard deviations of the slopes along the lidar's azimuth and across,
-        averaged over a footprint [1], above 0.
-    efficiency : float, optional
-        As for `bottom`.
+    `dataset`: waveforms of at least two pixels. `wind_speed`: wind speed [m/s], 1 to 30, whose sea gives the prior. By
+    default, the scene's if its sea has the Elfouhaily spectrum and the Cox and Munk slopes. `wind_direction_deg`:
+    direction that the wind blows towards, counter-clockwise from +x [degree]. By default, the scene's, or +x.
+    `slope_deviation`: prior for an unknown sea instead: standard deviations of the slopes along the lidar's azimuth and
+    across, averaged over a footprint [1], above 0. `efficiency`: as for `bottom`.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``shot`` if present: ``slope_along``, positive for a face towards the lidar, ``slope_across``, positive for
-        a rise to the left [1], with ``_stderr``; ``slope_deg`` and ``slope_direction_deg`` of the steepest rise from
-        the lidar's azimuth to the left [degree]; ``surface_range`` along the axis, with ``_stderr``, and
-        ``surface_height`` above the mean level [m], with ``_stderr``; ``plane_misfit`` [ns]. NaN where the pixels do
-        not determine it. Attributes: ``slope_method``: ``times and strengths``, ``times on a sea`` or ``times``; and
-        ``slope_prior_deviation``: prior standard deviations along and across [1] and of the range [m]. Without a sea
-        model, a slope beyond 5 standard deviations of the sea's slopes (attribute ``surface_slope_variance``) is NaN as
-        well, and ``slope_refused`` is 1.
+    Result: over ``shot`` if present: ``slope_along``, positive for a face towards the lidar, ``slope_across``, positive
+    for a rise to the left [1], with ``_stderr``; ``slope_deg`` and ``slope_direction_deg`` of the steepest rise from
+    the lidar's azimuth to the left [degree]; ``surface_range`` along the axis, with ``_stderr``, and ``surface_height``
+    above the mean level [m], with ``_stderr``; ``plane_misfit`` [ns]. NaN where the pixels do not determine it.
+    Attributes: ``slope_method``: ``times and strengths``, ``times on a sea`` or ``times``; and
+    ``slope_prior_deviation``: prior standard deviations along and across [1] and of the range [m]. Without a sea model,
+    a slope beyond 5 standard deviations of the sea's slopes (attribute ``surface_slope_variance``) is NaN as well, and
+    ``slope_refused`` is 1.
 
-    Notes
-    -----
     With a known wind, the estimate is `surface_slope.slopes_on_sea`: slopes averaged over the beam's footprint, with
     errors that hold on this sea. It needs a Gaussian beam and 2 to 64 pixels with outlines. Strengths count if the
     waveform is in W and the efficiency known. Otherwise a plane is fitted to the times; without a prior, its slopes are
@@ -170,30 +156,20 @@ def bottom(dataset: xr.Dataset, slopes: xr.Dataset, *, efficiency: float | None 
 
     Raises `UserError` if the dataset lacks an attribute or a number is out of range.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Waveforms; their pixels are summed. All shots must be in the same water.
-    slopes : xarray.Dataset
-        Output of `surface_slopes`. An unknown slope is replaced by 0, an unknown range by the mean sea's.
-    efficiency : float, optional
-        Transmitter and receiver efficiency times the atmosphere's two-way transmittance, 0 to 1. By default, from the
-        attribute ``two_way_efficiency``.
+    `dataset`: waveforms; their pixels are summed. All shots must be in the same water. `slopes`: output of
+    `surface_slopes`. An unknown slope is replaced by 0, an unknown range by the mean sea's. `efficiency`: transmitter
+    and receiver efficiency times the atmosphere's two-way transmittance, 0 to 1. By default, from the attribute
+    ``two_way_efficiency``.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``shot`` if present and ``correction``: ``reflectance`` [1] through a level sea at its mean height
-        (``level``), through the shot's plane (``slope``), and from the ratio of the echo to the column (``column``),
-        with ``reflectance_stderr``; ``depth_m`` below the mean sea level [m], NaN for the last, with ``depth_m_stderr``
-        by noise, method, slope and height of the sea; ``reflectance_corrected`` and ``depth_corrected``, whether the
-        correction was applied: otherwise the value is the one before it. Also ``bottom_energy`` [J],
-        ``reflectance_flags``, sums of `bottom_errors.ReflectanceFlag`, and from the last reflectance
-        ``class_probability`` over ``bottom_class``. NaN without a bottom echo; reflectances are NaN where a flag is
-        set, without a column with a warning. Depth and energy are NaN if the echo comes from a target.
+    Result: over ``shot`` if present and ``correction``: ``reflectance`` [1] through a level sea at its mean height
+    (``level``), through the shot's plane (``slope``), and from the ratio of the echo to the column (``column``), with
+    ``reflectance_stderr``; ``depth_m`` below the mean sea level [m], NaN for the last, with ``depth_m_stderr`` by
+    noise, method, slope and height of the sea; ``reflectance_corrected`` and ``depth_corrected``, whether the
+    correction was applied: otherwise the value is the one before it. Also ``bottom_energy`` [J], ``reflectance_flags``,
+    sums of `bottom_errors.ReflectanceFlag`, and from the last reflectance ``class_probability`` over ``bottom_class``.
+    NaN without a bottom echo; reflectances are NaN where a flag is set, without a column with a warning. Depth and
+    energy are NaN if the echo comes from a target.
 
-    Notes
-    -----
     Reflectances ``level`` and ``slope`` use the mean attenuation over all shots. The ratio needs a column with at least
     8 bins in each shot, but hardly depends on the slope, and corrects for focusing by waves.
 
@@ -313,20 +289,12 @@ def water(dataset: xr.Dataset, *, efficiency: float | None = None) -> xr.Dataset
 
     Raises `UserError` if the view is too narrow, the dataset lacks an attribute or a number is out of range.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Waveforms; their pixels are summed. The field of view on the sea must be at least 6 m, far wider than the beam.
-    efficiency : float, optional
-        As for `bottom`.
+    `dataset`: waveforms; their pixels are summed. The field of view on the sea must be at least 6 m, far wider than the
+    beam. `efficiency`: as for `bottom`.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``shot`` if present: ``column_attenuation``, ``absorption``, ``backscattering`` and ``kd`` with
-        ``_stderr``, and ``attenuation`` with its bounds ``attenuation_low`` and ``attenuation_high`` [1/m]; see
-        `column_retrieval.WaterEstimate`. NaN without a column or where the pixels see less than a twentieth of the
-        beam.
+    Result: over ``shot`` if present: ``column_attenuation``, ``absorption``, ``backscattering`` and ``kd`` with
+    ``_stderr``, and ``attenuation`` with its bounds ``attenuation_low`` and ``attenuation_high`` [1/m]; see
+    `column_retrieval.WaterEstimate`. NaN without a column or where the pixels see less than a twentieth of the beam.
     """
     lidar = lidar_geometry(dataset.attrs)
     summed = surface_inputs.summed_pixels(dataset)

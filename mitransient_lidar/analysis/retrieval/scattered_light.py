@@ -166,18 +166,10 @@ def light_of(
 ) -> ScatteredLight:
     """Return the light in the water whose column has an exponential.
 
-    Parameters
-    ----------
-    view
-        The lidar.
-    decay, backscatter
-        Attenuation of the exponential along the path [1/m], and its level at the surface as a backscatter [1/(m sr)].
-    path, weights
-        Paths in the exponential's fitted bins [m], and weights of the column's logarithm there, shape (bins,).
-    deepest
-        Path of the bottom echo or deepest light [m].
-    ratio
-        Particle bb/b.
+    `view`: the lidar. `decay`, `backscatter`: attenuation of the exponential along the path [1/m], and its level at the
+    surface as a backscatter [1/(m sr)]. `path`, `weights`: paths in the exponential's fitted bins [m], and weights of
+    the column's logarithm there, shape (bins,). `deepest`: path of the bottom echo or deepest light [m]. `ratio`:
+    particle bb/b.
     """
     bb, a, depth = 2 * np.pi * backscatter / _FIRST_LEVEL, decay, deepest * view.system.cos_water
     for paths in _PATHS:

@@ -93,25 +93,13 @@ def fit_plane(
 ) -> SurfacePlane:
     """Fit a plane to the surface echoes in each shot's pixels.
 
-    Parameters
-    ----------
-    time_ns : array_like, shape (n, pixels)
-        Two-way surface echo times [ns]; NaN for a pixel without an echo.
-    light : PixelLight
-        Light distribution in the pixels.
-    off_nadir : float
-        Angle of the receiver's axis from the vertical [rad], 0 to below pi/2.
-    stderr_ns : array_like, shape () or (n, pixels)
-        Standard errors of the times from noise [ns], at least 0.
+    `time_ns`, shape (n, pixels): two-way surface echo times [ns]; NaN for a pixel without an echo. `light`: light
+    distribution in the pixels. `off_nadir`: angle of the receiver's axis from the vertical [rad], 0 to below pi/2.
+    `stderr_ns`, shape () or (n, pixels): standard errors of the times from noise [ns], at least 0.
 
-    Returns
-    -------
-    SurfacePlane
-        Both slopes with three echoes that are not collinear; with two at different angle_x, the slope along, assuming
-        that across is 0; otherwise neither.
+    Result: both slopes with three echoes that are not collinear; with two at different angle_x, the slope along,
+    assuming that across is 0; otherwise neither.
 
-    Notes
-    -----
     With t = tan(off_nadir), B/A = (along - t)/(1 + along t) and C/A = across/(cos(off_nadir) + along sin(off_nadir)),
     hence along = tan(off_nadir + arctan(B/A)). The fit is least squares in 1/rho with weights from the errors of the
     times. Tulldahl (2006), FOI-R-2074-SE, section 3.1, states that times determine the slope, without a formula.
@@ -243,8 +231,6 @@ def slopes_on_sea(echoes: PixelEchoes, shots: SeaShots, scale: float | None) -> 
     `shots` are echoes of the same lidar at random locations on a sea with the same statistics. `scale` is pulse energy
     times efficiencies and aperture area [J m^2], positive; if None, strengths are not used.
 
-    Notes
-    -----
     The estimate is linear in the observations y: E[a] + Cov(a, y) (Cov(y, y) + N)^-1 (y - E[y]), with the error
     covariance Cov(a, a) - Cov(a, y) (Cov(y, y) + N)^-1 Cov(y, a). It has the least mean square error among linear
     estimates and is the posterior mean for Gaussian a and y (Rodgers 2000, Inverse Methods for Atmospheric Sounding,
@@ -353,8 +339,6 @@ def bottom_depth(
     It is D = R cos(theta) - H + s cos(alpha), with the paths along the ray in air, R, and in the water, s [m]. H is the
     lidar's height above the mean sea level [m], and theta the ray's angle from the vertical in air [rad].
 
-    Notes
-    -----
     A face away from the lidar refracts the ray towards the vertical. The path to the bottom is shorter (Tulldahl 2006,
     FOI-R-2074-SE, figure 12), and a depth with a level sea's angle is too small. Assumptions: the beam follows the axis
     through a plane, and scattering does not change the echo time.
@@ -369,8 +353,6 @@ def bottom_gain(surface_range: npt.ArrayLike, path: npt.ArrayLike, n: float, ray
     It is T^2 cos(alpha)/(S_s S_t), for an echo with the energy E A (rho/pi) gain exp(-2 K s); for a level sea it equals
     `lidar_geometry`'s. Paths are as for `bottom_depth`, n is the water's refractive index.
 
-    Notes
-    -----
     T is the facet's Fresnel transmittance. By Snell's law, a narrow pencil from the bottom point spreads through a
     plane with S_s = n R + s across the plane of incidence, and S_t = n R cos_water/cos_air + s cos_air/cos_water in it.
     """
@@ -398,15 +380,10 @@ def variances(
     error. Both are to first order about the level sea, for independent slopes and range. NaN quantities are not
     corrected.
 
-    Parameters
-    ----------
-    quantity : callable
-        Corrected quantity as a function of the slopes along and across [1] and the surface range [m].
-    surface_range : float
-        Range of a level sea at its mean height [m].
-    before, after : sequence of 3 array_like
-        Standard deviations of slopes and range on the sea, infinite where unknown; standard errors of their estimates.
-        They broadcast. A NaN error, for a slope that is not estimated, counts in neither.
+    `quantity`: corrected quantity as a function of the slopes along and across [1] and the surface range [m].
+    `surface_range`: range of a level sea at its mean height [m]. `before`, `after`: standard deviations of slopes and
+    range on the sea, infinite where unknown; standard errors of their estimates. They broadcast. A NaN error, for a
+    slope that is not estimated, counts in neither.
     """
     level = np.array([0.0, 0.0, surface_range])
     without, corrected = np.zeros(1), np.zeros(1)

@@ -39,9 +39,7 @@ def rotation_matrices(
 
     `roll_deg`, `pitch_deg`, `yaw_deg`: angles [deg], shape (n,). `rotation_spec`: order of the rotations.
 
-    Returns
-    -------
-    Rotation matrices, shape (n, 3, 3).
+    Result: shape (n, 3, 3).
     """
     angles = {"roll": roll_deg, "pitch": pitch_deg, "yaw": yaw_deg}
     first, second, third = (
@@ -92,14 +90,8 @@ def time_system(time_s: FloatArray, file: str | None = None, *, is_sbet: bool = 
 
     Raises UserError if the times may be Unix times.
 
-    Parameters
-    ----------
-    time_s
-        Times [s], not empty.
-    file
-        File of the trajectory, None for other platforms.
-    is_sbet
-        Whether that is an SBET file.
+    `time_s`: times [s], not empty. `file`: file of the trajectory, None for other platforms. `is_sbet`: whether that is
+    an SBET file.
     """
     latest = float(np.max(time_s))
     if file is None:
@@ -143,19 +135,10 @@ class PlatformPoses:
 def check_records(records: PlatformPoses, source: str, place: Callable[[int], str]) -> None:
     """Check that there are 2 records or more, of numbers from -1e12 to 1e12, at times that increase.
 
-    Parameters
-    ----------
-    records
-        Records whose arrays have matching lengths.
-    source
-        Name of all of them, for messages.
-    place
-        Name of a record, by its index from 0, for messages.
+    `records`: records whose arrays have matching lengths. `source`: name of all of them, for messages. `place`: name of
+    a record, by its index from 0, for messages.
 
-    Raises
-    ------
-    UserError
-        For the first record with a fault.
+    Raises `UserError` for the first record with a fault.
     """
     count = len(records.time_s)
     if count < 2:

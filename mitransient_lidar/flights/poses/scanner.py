@@ -54,10 +54,7 @@ class Scanner(Plan, ABC):
     def of_table(given: object) -> Scanner:
         """Return the scanner of a plan's ``[scanner]`` table: ``kind`` (`SCANNER_KINDS`) and its parameters.
 
-        Raises
-        ------
-        UserError
-            For a key or a value that is not allowed or is missing.
+        Raises `UserError` for a key or a value that is not allowed or is missing.
         """
         return of_kind("scanner", given, SCANNER_KINDS)
 

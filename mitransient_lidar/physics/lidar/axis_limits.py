@@ -142,8 +142,6 @@ class LidarView:
 
         The sea returns no light in a `dry` view or beam, which meets land alone.
 
-        Notes
-        -----
         Light follows directions in both view and beam. The first light is reflected at the height of the highest crest,
         or of a solid above it. The last light comes from the deepest part of a solid in these directions, or within 0.3
         of its depth of them, below a level sea at the height of the lowest trough. Multiply scattered light follows it:
@@ -267,8 +265,6 @@ def system_attenuation(attenuation: ArrayLike, kd: ArrayLike, spot_diameter: Arr
     downwelling irradiance [1/m], at least 0. `spot_diameter`: diameter D of the spot on the sea surface that the lidar
     illuminates and views [m], at least 0.
 
-    Notes
-    -----
     Gordon (1982), Appl. Opt. 21, 2996, doi:10.1364/AO.21.002996, solved the transfer by Monte Carlo for a level sea.
     The signal decays exponentially over four attenuation lengths. It decays with c where the radius R of the spot in
     view is far below 1/c, and with Kd where c R is above 5 to 6. Between them K depends on c and the whole volume

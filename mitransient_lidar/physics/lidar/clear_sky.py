@@ -52,8 +52,6 @@ def clear_sky_irradiance(
     asymmetry. `ozone_cm`: ozone column [atm cm], 0 to 1. `pressure_hpa`: pressure at sea level [hPa], 0 (no Rayleigh
     scattering) to 1100. `wavelength_nm`: wavelength [nm] that the irradiance must represent, 510 to 540.
 
-    Notes
-    -----
     Gregg and Carder's model (1990, doi:10.4319/lo.1990.35.8.1657) for cloudless maritime atmospheres, at one
     wavelength; the aerosol is given by its optical depth instead of visibility and winds. Its rms error against
     measured spectra is 6.6 %. Air mass: Kasten and Young (1989, doi:10.1364/AO.28.004735). As in the original model,

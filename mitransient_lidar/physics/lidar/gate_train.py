@@ -58,8 +58,6 @@ class GateShape:
 
     Build one with `edges`, `sampled` or `from_file`.
 
-    Notes
-    -----
     An edge with full length L is sin^2(pi u / (2 L)) for 0 <= u <= L, half open in its middle. It is smooth and finite,
     with an integral in closed form, R(t) = (u - L/pi sin(pi u/L)) / 2 for u = t + L/2. A gate is the difference between
     two such edges, its integral the difference between theirs. Edges of 0 ns are sharp; the gate is then half open as

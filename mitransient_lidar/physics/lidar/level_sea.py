@@ -304,8 +304,6 @@ def read_divergence(read: Read, is_top_hat: bool = False) -> float | None:
     `read`: reader of the plugin parameters. `is_top_hat`: whether the irradiance is even up to the beam's edge instead
     of Gaussian.
 
-    Notes
-    -----
     A Gaussian exp(-r^2/(2 sigma^2)) has fallen to e^-1/2, to a half and to e^-2 at diameters of 2 sigma, 2 sqrt(2 ln 2)
     sigma = 2.355 sigma and 4 sigma. A top-hat beam has its full irradiance up to its edge and none beyond: all three
     are its full angle.

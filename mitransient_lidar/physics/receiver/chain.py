@@ -58,8 +58,6 @@ class ReceiverChain:
 
     Raises UserError if the stages do not fit together.
 
-    Notes
-    -----
     Mean and variance are exact up to the amplifier. For logarithm, saturation and rounding a sample is assumed to be
     normally distributed. This holds where the amplifier's noise or tens of photoelectrons within its response dominate.
     With a logarithm and less than one photoelectron, errors of 0.05 standard deviations in the mean and of a third in

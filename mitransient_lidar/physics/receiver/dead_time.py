@@ -68,8 +68,6 @@ def firing_probability(events: FloatArray, dead: DeadBins) -> tuple[FloatArray, 
 
     fired = live (1 - exp(-events)), and live is 1 minus the probability of firing in the dead bins before.
 
-    Notes
-    -----
     P. B. Coates, J. Phys. E 1, 878 (1968), doi:10.1088/0022-3735/1/8/437, for a dead time up to the end of the record.
     """
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
@@ -110,8 +108,6 @@ def pair_covariances(
 
     Result: item l contains the covariance between the counts in bins k and k + l, shape (..., time - l).
 
-    Notes
-    -----
     A count renews the process (Feller 1948, "On probability problems in the theory of counters"): the probability of
     another count at lag l follows from the recursion of `firing_probability` started with a count.
     """

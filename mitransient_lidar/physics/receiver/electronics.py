@@ -90,8 +90,6 @@ MEAN_OF_BINS = LowPass(1, -1, np.ones(1))  #: Without a low-pass a sample is the
 class Amplifier(Plan):
     """Transimpedance amplifier or load resistor.
 
-    Notes
-    -----
     A coupling capacitor removes steady light from the signal. An echo with charge Q leaves a baseline that is lower by
     R Q/coupling_ns and recovers as exp(-t/coupling_ns), in full where the echo itself is clipped. The capacitor changes
     neither the amplifier's noise nor the signal variance here; really the latter is less by about the low-pass response
@@ -235,8 +233,6 @@ class LogAmplifier(Plan):
 class Digitiser(Plan):
     """Analogue-to-digital converter.
 
-    Notes
-    -----
     Rounding adds a variance of step^2/12 (W. R. Bennett, Bell Syst. Tech. J. 27, 446 (1948)) if the preceding noise is
     at least about half a step. A steady signal with less noise has an error of up to half a step instead.
     """

@@ -47,8 +47,6 @@ def sample_moments(
 
     Result: in `ReceiverChain.units`, and per parameter unit.
 
-    Notes
-    -----
     The amplifier's low-pass, which filters its own noise and the shot noise alike, correlates neighbouring samples. So
     does the dead time of counters and cells; the covariance is exact for all of these. A converter adds an independent
     variance of step^2/12, after a logarithm times its squared inverse slope at the mean (see `Digitiser`). Derivatives

@@ -16,8 +16,6 @@ from mitransient_lidar.core.validation import FloatArray
 class ShotJitter(Plan):
     """Fluctuation of pulse energy, trigger and clocks from shot to shot.
 
-    Notes
-    -----
     Times are normally distributed. A time error sigma is a range error c sigma / (2 n) from the lidar, n the group
     index: 1.1 cm for 0.1 ns in water. It does not change depths between surface and bottom in one channel.
     """

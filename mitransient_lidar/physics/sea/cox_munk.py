@@ -27,8 +27,6 @@ def cox_munk(wind_speed: float) -> tuple[float, float]:
 
     Returns `upwind`, `crosswind`: slope variances [1]. At zero wind the regression gives 0.003 crosswind.
 
-    Notes
-    -----
     Cox and Munk (1954), J. Opt. Soc. Am. 44, 838, doi:10.1364/JOSA.44.000838: 3.16e-3 W and 0.003 + 1.92e-3 W.
     """
     wind = in_range("wind_speed", wind_speed, 0, MAX_WIND_SPEED)
@@ -62,8 +60,6 @@ class GramCharlierSeries:
 
         `wind_speed`: wind speed [m/s], 1 to 14.
 
-        Notes
-        -----
         Cox and Munk (1954): 0.01 - 0.0086 W (+- 0.03), 0.04 - 0.033 W (+- 0.12), 0.40 (+- 0.23), 0.12 (+- 0.06) and
         0.23 (+- 0.41), from slopes up to 2.5 standard deviations.
         """
@@ -137,8 +133,6 @@ def foam_cover(foam: str, wind_speed: float) -> float:
 
     `foam`: ``none``, a number from 0 to 1, or the name of a law. `wind_speed`: wind speed U at 10 m [m/s].
 
-    Notes
-    -----
     Monahan and O'Muircheartaigh 1980, doi:10.1175/1520-0485(1980)010<2094:OPLDOO>2.0.CO;2: 2.95e-6 U^3.52. Callaghan et
     al. 2008, doi:10.1029/2008GL036165: 3.18e-5 (U - 3.7)^3 from 3.7 m/s, and 4.82e-6 (U + 1.98)^3 from where both are
     equal, 10.2 m/s. Stramska and Petelski 2003, doi:10.1029/2002JC001321: 8.75e-5 (U - 6.33)^3 from 6.33 m/s. At one

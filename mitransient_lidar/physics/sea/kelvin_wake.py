@@ -34,16 +34,34 @@ def kelvin_wake(
 ) -> FloatArray:
     """Height of a ship's steady wake on grid lines.
 
-    `x`, `y`, shapes (columns,) and (rows,): positions of the grid lines [m], strictly increasing, at least 2 each. They
-    need not be evenly spaced. `speed`: speed U of the ship through the water [m/s], positive. `bearing`: travel
-    direction [rad], counter-clockwise from +x. `length`: waterline length L [m], positive. `beam`, `draught`: full
-    width B and depth T of the hull [m], positive; L/8 and L/20 by default. Heights are proportional to B. `ship_x`,
-    `ship_y`: position of the ship's middle [m]. `smallest_wavelength`: shortest wavelength in the result [m], positive.
-    The theory neglects surface tension, which increases the phase speed of 0.1 m waves by 1.4 %.
+    Parameters
+    ----------
+    x, y : array_like, shapes (columns,) and (rows,)
+        Positions of the grid lines [m], strictly increasing, at least 2 each. They need not be evenly spaced.
+    speed : float
+        Speed U of the ship through the water [m/s], positive.
+    bearing : float
+        Travel direction [rad], counter-clockwise from +x.
+    length : float
+        Waterline length L [m], positive.
+    beam, draught : float, optional
+        Full width B and depth T of the hull [m], positive; L/8 and L/20 by default. Heights are proportional to B.
+    ship_x, ship_y : float
+        Position of the ship's middle [m].
+    smallest_wavelength : float
+        Shortest wavelength in the result [m], positive. The theory neglects surface tension, which increases the phase
+        speed of 0.1 m waves by 1.4 %.
 
-    Result, shape (rows, columns): elevation [m] of the waves at (x[i], y[j]) for heights[j, i]. Raises `UserError` if a
-    size or the speed is not positive, a number not finite, the grid lines are fewer than 2 or not increasing, or the
-    ship is too far away for its shortest waves on the grid.
+    Returns
+    -------
+    ndarray, shape (rows, columns)
+        Elevation [m] of the waves at (x[i], y[j]) for heights[j, i].
+
+    Raises
+    ------
+    UserError
+        If a size or the speed is not positive, a number not finite, the grid lines are fewer than 2 or not increasing,
+        or the ship is too far away for its shortest waves on the grid.
 
     Notes
     -----

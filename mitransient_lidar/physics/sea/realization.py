@@ -51,8 +51,6 @@ def angular_frequency(k: npt.ArrayLike, depth: float = math.inf) -> FloatArray:
 
     `k`: wavenumber [rad/m], not negative. `depth`: water depth [m], positive or infinite.
 
-    Notes
-    -----
     Linear waves (Lamb 1932, Hydrodynamics, sections 229 and 267): omega^2 = (g k + (T/rho) k^3) tanh(k depth) with
     T/rho = g/(370 rad/m)^2 = 7.17e-5 m^3/s^2, the surface tension for the slowest wave in the Elfouhaily spectrum.
     """
@@ -149,8 +147,6 @@ def facet_slope_variance(
     of wavelengths along x and y over the period, from `wave_numbers`. `period`, `cells`: period [m], and its length in
     cells, which may be broken. `axis`: direction [rad], counter-clockwise from +x.
 
-    Notes
-    -----
     Facet slopes are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d, d the cell side.
     Their covariance is for cells split along the diagonal from (i+1, j) to (i, j+1), averaged over both triangles in a
     cell. It is 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds oblique to the
@@ -274,8 +270,6 @@ class Band:
 class Interpolation:
     """Interpolation of waves from a periodic grid, in single precision.
 
-    Notes
-    -----
     A non-uniform Fourier transform of type 2 with the kernel exp(b ((1 - z^2)^(1/2) - 1)) (Barnett, Magland and af
     Klinteberg 2019, SIAM J. Sci. Comput. 41, C479). Waves are divided by the transform of the kernel.
     """

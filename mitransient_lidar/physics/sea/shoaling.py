@@ -66,8 +66,6 @@ def band_wavenumbers(state: SeaState, shortest_wave: float) -> FloatArray:
 class DepthResponse:
     """Band amplitudes at each depth, relative to deep water.
 
-    Notes
-    -----
     Wind waves with the wavenumber k have the TMA spectrum for the depth d_e (`wind_spectra.ShallowSpectrum`): the
     amplitude factor (S(k; d_e)/S(k))^(1/2). At constant frequency this is Kitaigorodskii's variance factor
     tanh(kd)^2/(1 + 2kd/sinh(2kd)). Its form in wavenumbers fits waves that are realised by wavenumber: it keeps the

@@ -148,8 +148,6 @@ def bottom_reflectance(name: str, value: object, wavelength_nm: float = 532.0) -
 
     Result: reflectance, 0 to 1; for a name linear between the values of the table, 10 nm apart.
 
-    Notes
-    -----
     Irradiance reflectance of clean coral sand, the green alga Boodlea, brown algae (mean of Turbinaria and Sargassum)
     and red algae (mean of Porolithon and Corallinaceae), from figure 6 in Maritorena, Morel and Gentili (1994), Limnol.
     Oceanogr. 39, 1689, doi:10.4319/lo.1994.39.7.1689. Dry and wet sand from one beach, an old asphalt road, a light

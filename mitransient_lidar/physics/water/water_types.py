@@ -142,8 +142,6 @@ def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
 
     Raises `UserError` if there is no such type.
 
-    Notes
-    -----
     Kd: Jerlov (1976), Marine Optics, Table XXVII. Scattering in IB to 5C: measurements compiled by Williamson and
     Hollins (2022), Appl. Opt. 61, 9951; in 7C and 9C: Solonenko and Mobley (2015), Appl. Opt. 54, 5392,
     doi:10.1364/AO.54.005392, who derived it from Kd. No source gives the backscattering. In types IB to III the
@@ -179,8 +177,6 @@ def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentP
 
     `concentration`: chlorophyll concentration C [mg/m^3], 0.01 to 30. `wavelength_nm`: wavelength [nm], 400 to 700.
 
-    Notes
-    -----
     Diffuse attenuation: Kd = aw + bw/2 + chi C^e by Morel and Maritorena (2001), J. Geophys. Res. 106, 7163,
     doi:10.1029/2000JC000319. Particles: b_p = 0.416 C^0.766 (wavelength/550)^v by Loisel and Morel (1998), Limnol.
     Oceanogr. 43, 847, doi:10.4319/lo.1998.43.5.0847, with v = (lg C - 0.3)/2 below 2 mg/m^3 and 0 above, and
@@ -208,8 +204,6 @@ def near_infrared(green: InherentProperties, wavelength_nm: float) -> InherentPr
 
     `green`: the water at 532 nm. `wavelength_nm`: wavelength [nm], above 700 to 1100.
 
-    Notes
-    -----
     The absorption has two parts. `water_absorption` gives at least 0.62 1/m. The excess over pure water at 532 nm
     decreases by exp(-0.014 (wavelength - 532)), as for dissolved matter (Bricaud, Morel and Prieur 1981, Limnol.
     Oceanogr. 26, 43, doi:10.4319/lo.1981.26.1.0043); a ten thousandth is left at 1064 nm. Scattering and backscattering
@@ -255,8 +249,6 @@ def from_kd(kd: float) -> InherentProperties:
 
     `kd`: diffuse attenuation coefficient of downwelling irradiance [1/m], 0.0486 (Jerlov I) to 0.738 (Jerlov 9C).
 
-    Notes
-    -----
     Albedo and bb/b are linear in ln Kd between the `jerlov` values, so that Kd = 0.0796 gives jerlov("II"). Absorption
     follows from `InherentProperties.kd`. It has an error of about 15 %, and scattering a factor of 2: at Kd = 0.08 the
     two sources of `jerlov` have 0.18 and 0.38 1/m.
@@ -286,8 +278,6 @@ def from_secchi(depth: float) -> InherentProperties:
 
     `depth`: Secchi depth z [m], 0.5 to 25.
 
-    Notes
-    -----
     Kd = 1.7/z by Poole and Atkins (1929), J. Mar. Biol. Assoc. 16, 297, and c + Kd = 8.7/z by Tyler (1968), Limnol.
     Oceanogr. 13, 1, doi:10.4319/lo.1968.13.1.0001; absorption then follows from `InherentProperties.kd`. In turbid
     coastal water Holmes (1970), Limnol. Oceanogr. 15, 688, found 1.44 and 9.42; the first constant was 1.2 to 3 in
@@ -311,12 +301,21 @@ def water_of(
 ) -> InherentProperties:
     """Return a water's inherent optical properties.
 
-    `kind`: ``jerlov``, ``chlorophyll``, ``kd``, ``secchi``, ``petzold`` or ``pure``. `value`: Jerlov's type (``I`` to
-    ``9C``), chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m] or Petzold's ``clear``, ``coastal`` or ``turbid``; None
-    for pure sea water. `wavelength_nm`, `temperature`, `salinity`: wavelength [nm], temperature [deg C] and salinity
-    [per mille]. Above 700 nm, `near_infrared` takes a water with particles there from 532 nm.
+    Parameters
+    ----------
+    kind
+        ``jerlov``, ``chlorophyll``, ``kd``, ``secchi``, ``petzold`` or ``pure``.
+    value
+        Jerlov's type (``I`` to ``9C``), chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m] or Petzold's ``clear``,
+        ``coastal`` or ``turbid``; None for pure sea water.
+    wavelength_nm, temperature, salinity
+        Wavelength [nm], temperature [deg C] and salinity [per mille]. Above 700 nm, `near_infrared` takes a water with
+        particles there from 532 nm.
 
-    Raises `UserError` if the kind is unknown, or a value is missing, not a number or out of range.
+    Raises
+    ------
+    UserError
+        If the kind is unknown, or a value is missing, not a number or out of range.
     """
     if kind not in WATER_KINDS:
         raise UserError(f"kind = {kind!r} must be one of {', '.join(WATER_KINDS)}")

@@ -364,8 +364,6 @@ class HexPixels(PixelArray):
     `layout`: ``hexN`` with N = 1, 7, 19, 37, ... hexagons. `field_of_view`: circle diameter [rad], positive.
     `fill_factor`: share of each hexagon that receives light, 0.01 to 1: a smaller hexagon about the same centre.
 
-    Notes
-    -----
     A hexagon has the axial coordinates (column, row) with its centre at angle_x = 1.5 s row and angle_y = sqrt(3) s
     (column + row / 2).
     """
