@@ -45,9 +45,7 @@ _R = TypeVar("_R")
 _LOG = logging.getLogger(__name__)
 
 DENSEST = 12.0  # largest optical density
-
-#: Largest share of a series' shots that may saturate with an automatic gain or filter.
-SATURATING = 0.05
+SATURATING = 0.05  #: Largest share of a series' shots that may saturate with an automatic gain or filter.
 
 _GAIN = (
     "Factor of the amplifier's gain, or auto for the largest up to 1 without saturation, but of 5 % of a series' "

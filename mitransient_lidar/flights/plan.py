@@ -33,15 +33,13 @@ from mitransient_lidar.results.attributes import PointClass
 #: Parameters of the scene that the poses of the pulses replace.
 POSE_PARAMETERS = ("aim_x", "aim_y", "altitude", "off_nadir_deg")
 
-#: Most pulses of a flight.
-MOST_PULSES = 1_000_000
+MOST_PULSES = 1_000_000  #: Most pulses of a flight.
 
 #: Classes of echoes between surface and bottom: objects, vegetation of the draft of the second bathymetric profile of
 #: LAS (46), and vegetation as NOAA marked it before (64).
 OBJECT_CLASSES = (int(PointClass.OBJECT), 46, 64)
 
-#: Largest difference of coordinates of one place [m], that of the rounding in files.
-SAME_PLACE_M = 1e-3
+SAME_PLACE_M = 1e-3  #: Largest difference of coordinates of one place [m], that of the rounding in files.
 
 
 @dataclass(frozen=True)

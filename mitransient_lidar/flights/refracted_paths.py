@@ -14,8 +14,7 @@ from mitransient_lidar.core.validation import BoolArray, FloatArray, finite_arra
 from mitransient_lidar.flights.sea_surface import Facets, SurfaceModel
 from mitransient_lidar.physics.lidar.level_sea import cos_in_water, refract
 
-#: Ratio of errors from which a pulse's own surface replaces a plane through several.
-_CLEARLY = 2.0
+_CLEARLY = 2.0  #: Ratio of errors from which a pulse's own surface replaces a plane through several.
 
 
 @dataclass(frozen=True)

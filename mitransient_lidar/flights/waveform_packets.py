@@ -13,8 +13,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, finite_array, integer, positive
 
-#: Reserved, user, record, bytes that follow, description.
-_HEADER = struct.Struct("<H16sHQ32s")
+_HEADER = struct.Struct("<H16sHQ32s")  #: Reserved, user, record, bytes that follow, description.
 _LENGTH_AT = 20  # position of the number of bytes that follow
 _DESCRIPTOR = struct.Struct("<BBIIdd")
 _BITS = 16

@@ -35,8 +35,7 @@ COMBINATIONS = ("single", "sum", "brightest", "best")
 #: Half widths of the gate about the target's echo, and of the search for its time, in pulse widths.
 HALF_GATE, HALF_SEARCH = 1.5, 0.8
 
-#: Confidence of all intervals.
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  #: Confidence of all intervals.
 
 _LEVELS = (1e-8, 1e4)  # smallest and largest fraction of the target's signal, or of the pulse energy
 _DELAYS = 41  # in the matched filter

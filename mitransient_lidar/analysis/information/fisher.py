@@ -313,10 +313,8 @@ def _labelled(
     return label(xr.Dataset(data, coords, {**kept, "remarks": "\n".join(remarks)}))
 
 
-#: Eigenvalue of the unit-diagonal matrix below which parameters are indistinguishable.
-SINGULAR = 1e-8
-#: Correlation between two estimates above which they are named.
-CORRELATED = 0.999
+SINGULAR = 1e-8  #: Eigenvalue of the unit-diagonal matrix below which parameters are indistinguishable.
+CORRELATED = 0.999  #: Correlation between two estimates above which they are named.
 
 _INVOLVED = 1e-3  # component of an eigenvector from which on a parameter belongs to it
 

@@ -25,8 +25,7 @@ from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.results.geometry import optional_number, pose_of
 
-#: Largest relative standard error with which a reflectance is given.
-LARGEST_ERROR = 0.5
+LARGEST_ERROR = 0.5  #: Largest relative standard error with which a reflectance is given.
 #: Smallest share of the beam's energy in the pixels at which scattered light does not dominate their echoes.
 LEAST_SHARE = 0.05
 

@@ -21,9 +21,7 @@ from mitransient_lidar.physics.water.water_types import PETZOLD_BACKSCATTER_RATI
 
 _FEWEST_BINS = 3  # in a fit
 _LARGEST_ERROR = 0.5  # relative standard error of a bin: a noisier one has a biased logarithm
-
-#: Beam edge in standard deviations.
-BEAM_EDGE = 3.0
+BEAM_EDGE = 3.0  #: Beam edge in standard deviations.
 
 
 @dataclass(frozen=True)
@@ -107,8 +105,7 @@ class ColumnBins:
 #: attenuation.
 SMALLEST_SPOT = 6.0
 
-#: Relative error of bb and Kd by the method.
-METHOD_ERROR = 0.1
+METHOD_ERROR = 0.1  #: Relative error of bb and Kd by the method.
 
 #: Particle bb/b: the typical value, and a range that includes most natural waters.
 BACKSCATTER_RATIO, BACKSCATTER_RATIOS = PETZOLD_BACKSCATTER_RATIO, (0.003, 0.05)

@@ -21,8 +21,7 @@ from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
 BoolArray = npt.NDArray[np.bool_]
 
-#: Least wind speed [m/s] that Cox and Munk measured.
-LEAST_WIND_SPEED = 1.0
+LEAST_WIND_SPEED = 1.0  #: Least wind speed [m/s] that Cox and Munk measured.
 
 _SEAS, _SHOTS = 4, 150  # realisations, and shots on each
 _CELLS = 512  # per side of a realisation

@@ -66,17 +66,13 @@ _LOG = logging.getLogger(__name__)
 #: Systems of times: from any beginning, that of a GPS week, 6 January 1980, and 10^9 s later, in 2011.
 TimeSystem = Literal["flight", "gps_week", "gps", "adjusted_gps"]
 
-#: What adjusted GPS times are less than those since 1980 [s].
-ADJUSTMENT_S = 1e9
+ADJUSTMENT_S = 1e9  #: What adjusted GPS times are less than those since 1980 [s].
 
 #: Latest time of a week whose flight ends on the next day, and earliest adjusted time [s], of January 2012.
 _LATEST_OF_WEEK, _EARLIEST_ADJUSTED = 8 * 86_400, 1e7
 
-#: Earliest time that may be Unix time [s], of September 2020, and GPS time of 2030.
-_MAY_BE_UNIX = 1.6e9
-
-#: Unix time less GPS time [s], with the 18 leap seconds since 2017.
-_UNIX_LESS_GPS = 315_964_782
+_MAY_BE_UNIX = 1.6e9  #: Earliest time that may be Unix time [s], of September 2020, and GPS time of 2030.
+_UNIX_LESS_GPS = 315_964_782  #: Unix time less GPS time [s], with the 18 leap seconds since 2017.
 
 _EPOCH = datetime.datetime(1980, 1, 6)
 
@@ -116,8 +112,7 @@ def tell_time_system(system: str, time_s: FloatArray) -> None:
         )
 
 
-#: Largest number of a record: angles in double precision keep 0.1 millidegrees.
-_LARGEST = 1e12
+_LARGEST = 1e12  #: Largest number of a record: angles in double precision keep 0.1 millidegrees.
 
 
 @dataclass(frozen=True, eq=False)

@@ -157,8 +157,7 @@ Interpolation = Literal["linear", "cubic"]
 #: Longest time between records that splines go through, with its rounding, and fewest of such records [s].
 _DENSE_S, _FEWEST_DENSE = 1.0 + 1e-6, 3
 
-#: Most pulses of a flight.
-_MOST_PULSES = 10**8
+_MOST_PULSES = 10**8  #: Most pulses of a flight.
 
 #: Pulses later than the end of a line by less than this part of their interval belong to it.
 _LAST_PULSE = 1e-6
