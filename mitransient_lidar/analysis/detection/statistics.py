@@ -375,7 +375,7 @@ def delays(samples: FloatArray, templates: FloatArray, delays_ns: FloatArray, co
     interpolated by a parabola through the best delay and its neighbours, within `delays_ns`.
     """
     step = float(delays_ns[1] - delays_ns[0])
-    filters = _solved(covariance, templates.T)
+    filters = _filters(covariance, templates.T)
     score = samples @ (filters / np.sqrt(np.sum(templates.T * filters, axis=0)))
     best = np.clip(np.argmax(score, axis=1), 1, delays_ns.size - 2)
     left, middle, right = (score[np.arange(len(samples)), best + shift] for shift in (-1, 0, 1))
@@ -392,12 +392,12 @@ def delay_bound(templates: FloatArray, delays_ns: FloatArray, covariance: FloatA
     """
     i = delays_ns.size // 2
     echo, slope = templates[i], (templates[i + 1] - templates[i - 1]) / (delays_ns[i + 1] - delays_ns[i - 1])
-    filters = _solved(covariance, np.array([echo, slope]).T)
+    filters = _filters(covariance, np.array([echo, slope]).T)
     information = float(slope @ filters[:, 1] - (slope @ filters[:, 0]) ** 2 / (echo @ filters[:, 0]))
     return float(1 / np.sqrt(information))
 
 
-def _solved(covariance: FloatArray, right: FloatArray) -> FloatArray:
+def _filters(covariance: FloatArray, right: FloatArray) -> FloatArray:
     """Return the covariance's inverse times `right`."""
     try:
         return np.asarray(np.linalg.solve(covariance, right))
