@@ -40,10 +40,8 @@ def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, see
     parameter pairs: the mean over runs, for the share of records with a bottom echo, else for peak power, else for the
     error.
 
-    Raises UserError if no run is done, or the file name has another suffix.
-
-    `dataset`: a campaign as from `campaigns.store.open_campaign`. `path`: PNG, PDF or SVG file to write. `seed`: sample
-    seed.
+    Raises UserError if no run is done, or the file name has another suffix. `dataset`: a campaign as from
+    `campaigns.store.open_campaign`. `path`: PNG, PDF or SVG file to write. `seed`: sample seed.
     """
     figure = drawing.new_figure(path, 11.0, 9.6)
     done = np.flatnonzero(dataset["status"].values == _DONE)
@@ -88,17 +86,14 @@ def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> N
     # A logarithmic axis has no values below 0, and lower ones would be drawn as a level. So would the dark before the
     # first light: after a converter it is the code next to 0.
     values[(values < 1 / _DYNAMIC_RANGE[name]) | (values <= values[:, :1])] = np.nan
-    ax.set_yscale("log")
-    ax.set_ylim(1 / _DYNAMIC_RANGE[name], 2)
+    ax.set(yscale="log", ylim=(1 / _DYNAMIC_RANGE[name], 2))
     name_of, column = next(iter(_numbers(_inputs(dataset, runs)).items()), ("run", runs))
     # The lightest colours are hard to see on white.
     colours = ScalarMappable(Normalize(column.min(), column.max() + 0.08 * np.ptp(column)), palette.SEQUENCE)
     for line, value in zip(values, column, strict=True):
         ax.plot(time, line, color=colours.to_rgba(value), linewidth=0.9)
     ax.figure.colorbar(colours, ax=ax, label=_labelled(dataset, name_of))
-    ax.set_xlabel(drawing.TIME_LABEL)
-    ax.set_ylabel(f"{name}, relative to its peak")
-    drawing.add_grid(ax)
+    drawing.finish(ax, xlabel=drawing.TIME_LABEL, ylabel=f"{name}, relative to its peak")
 
 
 def _numbers(inputs: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:

@@ -259,15 +259,21 @@ def new_panels(
 
 
 def finish(
-    ax: Axes, title: str = "", *, grid: Literal["both", "x"] = "both", zero: float | None = None, **given: Any
+    ax: Axes,
+    title: str = "",
+    *,
+    grid: Literal["both", "x"] = "both",
+    hide: tuple[str, ...] = (),
+    zero: float | None = None,
+    **given: Any,
 ) -> None:
-    """Add a title, a grid and a line at a value to a panel, and set labels, limits and scales that are given."""
+    """Add a title, a grid and a line at a value to a panel, hide frame sides, and set labels, limits and scales."""
     if title:
         ax.set_title(title, fontsize="medium")
     if zero is not None:
         ax.axhline(zero, color="0.6", linewidth=0.8)
     ax.set(**given)
-    add_grid(ax, grid)
+    add_grid(ax, grid, hide)
 
 
 def name_sides(

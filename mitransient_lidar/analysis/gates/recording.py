@@ -33,8 +33,6 @@ def record_gates(
 
     Arguments as for `analysis.receiver.detect_waveforms`, with gain and optical density as settings.
 
-    Notes
-    -----
     Gate jitter needs the energy in shifted gates. It comes from waveforms in the same dataset, or else from the gates
     before and after one if they follow within the longer of the pulse and the gate's edges. With neither, it is left
     out, and a warning reports it. The mean of a stack that was rendered with jitter has it already. The standard errors
@@ -164,14 +162,9 @@ def jittered_beside(
     Without gates that follow within the longer of pulse and edges, it is left out with a warning. The derivative is
     None without jitter, or where it is left out.
 
-    Parameters
-    ----------
-    energy : ndarray
-        Energy in the gates, shape (..., gate) [J], as of the mean; the derivative is in J/ns.
-    jitter, included : float
-        Standard deviation of the gate time, and its part that the energy already has [ns].
-    step, longest : float
-        Time from gate to gate, and the longest one that shows the energy between them [ns].
+    `energy`: energy in the gates, shape (..., gate) [J], as of the mean; the derivative is in J/ns. `jitter`,
+    `included`: standard deviation of the gate time, and its part that the energy already has [ns]. `step`, `longest`:
+    time from gate to gate, and the longest one that shows the energy between them [ns].
     """
     if jitter == 0:
         return energy, None

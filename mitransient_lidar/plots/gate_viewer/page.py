@@ -43,10 +43,9 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
     For a shot series it is the mean, with the mean's standard error. The waveform's attribute ``units`` is W, V or 1,
     and its ``long_name`` belongs to the variable shown.
 
-    Raises UserError if it has another shape, no pixel angles, or attributes or times that are invalid.
-
-    `dataset`: a result with ``waveform``, or a record with ``signal``, over (pixel, time) or (row, column, time), after
-    ``shot`` if it has shots.
+    Raises UserError if it has another shape, no pixel angles, or attributes or times that are invalid. `dataset`: a
+    result with ``waveform``, or a record with ``signal``, over (pixel, time) or (row, column, time), after ``shot`` if
+    it has shots.
     """
     name = next(name for name in RECORDS if name in dataset)
     dims = record_dims(dataset, name, shots=True)
@@ -134,17 +133,15 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
     the errors.
 
     Raises UserError if `stack` has neither gates nor a record in time, `result` has other pixels, or `limit_mb` is not
-    above 0 or too small for the gates of one block (of all pixels, if they form no image).
-
-    `stack`: a result with ``waveform`` [W], or a record with ``signal``, over (pixel, time) or (row, column, time); the
-    map shows one of its time bins. For a shot series, the page shows the mean. Pixels with outlines
-    (``pixel_outlines``) have their shapes. Or camera frames, whose mean above the dark level the page shows, or a gate
-    stack: ``gate_energy`` and ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the
-    coordinates ``gate_start`` and ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the surface echo time
-    is known, ``gate_depth`` [m]. With a result's lines of sight, pixel depths are along them; gate and time depths are
-    on the receiver's axis. `result`: a render of the same pixels, whose ``waveform`` [W] is plotted; by default `stack`
-    itself. Without waveforms a pixel's record is its energy in the gates. `limit_mb`: largest page size [MB of 1e6
-    bytes], above 0.
+    above 0 or too small for the gates of one block (of all pixels, if they form no image). `stack`: a result with
+    ``waveform`` [W], or a record with ``signal``, over (pixel, time) or (row, column, time); the map shows one of its
+    time bins. For a shot series, the page shows the mean. Pixels with outlines (``pixel_outlines``) have their shapes.
+    Or camera frames, whose mean above the dark level the page shows, or a gate stack: ``gate_energy`` and
+    ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the coordinates ``gate_start`` and
+    ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the surface echo time is known, ``gate_depth`` [m].
+    With a result's lines of sight, pixel depths are along them; gate and time depths are on the receiver's axis.
+    `result`: a render of the same pixels, whose ``waveform`` [W] is plotted; by default `stack` itself. Without
+    waveforms a pixel's record is its energy in the gates. `limit_mb`: largest page size [MB of 1e6 bytes], above 0.
     """
     positive("limit_mb", limit_mb)
     record: xr.Dataset | None

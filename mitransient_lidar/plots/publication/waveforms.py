@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -188,6 +188,7 @@ def add_pixel_legend(ax: Axes, loc: Literal["best", "upper left"] = "best") -> N
 
 
 _STYLES = ("-", "--", ":")
+_SECTION: dict[str, Any] = {"hide": ("top", "right"), "xlabel": "x (m)", "ylabel": "z (m)", "aspect": "equal"}
 
 
 def surface_echoes(renders: Renders) -> Figure:
@@ -231,11 +232,8 @@ def paths(renders: Renders) -> Figure:
         ax.plot([-2 * down[0], 0, end[0]], [-2 * down[1], 0, end[1]], color=palette.BEAM)
         ax.plot([0, 0], [0, -system.bottom_depth], color="0.6", linestyle=":")
         slope_deg, angle = math.degrees(math.atan(slope)), math.degrees(math.atan2(ray[0], -ray[1]))
-        ax.set_title(
-            f"12  shot {name}: slope {slope_deg:+.1f}°, in water {angle:.2f}°,\npath {path:.3f} m", fontsize="medium"
-        )
-        ax.set(xlabel="x (m)", ylabel="z (m)", xlim=(-2, 3), aspect="equal")
-        drawing.add_grid(ax, hide=("top", "right"))
+        title = f"12  shot {name}: slope {slope_deg:+.1f}°, in water {angle:.2f}°,\npath {path:.3f} m"
+        drawing.finish(ax, title, **_SECTION, xlim=(-2, 3))
     return figure
 
 
@@ -288,9 +286,7 @@ def system(_renders: Renders) -> Figure:
     )
     for ax, title in ((left, "5  system in air"), (right, "5  sea, level, and bottom")):
         ax.axhline(0, color=palette.SEA, linewidth=2)
-        ax.set_title(title, fontsize="medium")
-        ax.set(xlabel="x (m)", ylabel="z (m)", aspect="equal")
-        drawing.add_grid(ax, hide=("top", "right"))
+        drawing.finish(ax, title, **_SECTION)
     right.axhline(-numbers.bottom_depth, color=palette.BOTTOM, linewidth=2)
     right.plot([], [], color=palette.BEAM, label="beam, e$^{-1/2}$")
     right.plot([], [], color=palette.VIEW, linestyle="--", label="field of view")
@@ -339,9 +335,7 @@ def _draw_section(ax: Axes, numbers: System, lines: np.ndarray, heights: np.ndar
         end = point + 2.0 * refract(down, np.array([-slope, 1.0]), numbers.refractive_index)
         ax.plot([start[0], point[0]], [start[1], point[1]], color=palette.BEAM, linewidth=1)
         ax.plot([point[0], end[0]], [point[1], end[1]], color=palette.BEAM, linestyle="--", linewidth=1)
-    ax.set(xlabel="x (m)", ylabel="z (m)", aspect="equal")
-    ax.set_title("6 (a)  axes refracted by facets, section at y = 0", fontsize="medium")
-    drawing.add_grid(ax, hide=("top", "right"))
+    drawing.finish(ax, "6 (a)  axes refracted by facets, section at y = 0", **_SECTION)
 
 
 def pixels(renders: Renders) -> Figure:

@@ -128,11 +128,8 @@ def _draw_order_map(figure: Figure, ax: Axes, x: Any, y: Any, orders: Any) -> No
     lost = len(_ORDER_COLOURS) - 1
     norm = BoundaryNorm(np.arange(lost + 2) - 0.5, lost + 1)
     shown = np.where(orders < 0, lost, orders)
-    bar = figure.colorbar(
-        ax.pcolormesh(x, y, shown, cmap=ListedColormap(_ORDER_COLOURS), norm=norm, rasterized=True),
-        ax=ax,
-        ticks=range(lost + 1),
-    )
+    drawn = ax.pcolormesh(x, y, shown, cmap=ListedColormap(_ORDER_COLOURS), norm=norm, rasterized=True)
+    bar = figure.colorbar(drawn, ax=ax, ticks=range(lost + 1))
     bar.ax.set_yticklabels(_NAMES)
 
 
