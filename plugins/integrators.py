@@ -14,8 +14,7 @@ from mitransient_lidar.core.parameters.integrators import LIDAR_MERGING, LIDAR_V
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plugins.bases import DeclaredProperties, register
-from mitransient_lidar.transport.daylight.renderer import DaylightRenderer, ReceivedDaylight
-from mitransient_lidar.transport.daylight.scene import DaylightScene
+from mitransient_lidar.transport.daylight.renderer import DaylightRenderer, DaylightScene, ReceivedDaylight
 from mitransient_lidar.transport.merging.layout import MergingOptions
 from mitransient_lidar.transport.merging.renderer import MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses

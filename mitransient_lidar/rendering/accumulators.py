@@ -7,9 +7,10 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
@@ -29,9 +30,6 @@ from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gat
 from mitransient_lidar.results.sum_errors import with_correlation
 from mitransient_lidar.transport.paths.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.scene import LidarScene
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 logger = logging.getLogger(__name__)
 

@@ -15,11 +15,12 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option
@@ -31,9 +32,6 @@ from mitransient_lidar.rendering.render import render
 from mitransient_lidar.transport.paths.passes import PassRenderer
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene_parts import lidar_sensor
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 #: Measurement values: task labels and arguments.
 Tasks = Mapping[tuple[str, ...], Mapping[str, Any]]

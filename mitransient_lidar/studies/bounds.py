@@ -11,8 +11,8 @@ from typing import Annotated, Any
 import numpy as np
 import xarray as xr
 
+from mitransient_lidar.analysis.information.errors import jackknife_error
 from mitransient_lidar.analysis.information.fisher import fisher_information, priors
-from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.receiver import Gain, OpticalDensity, chain_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import (

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.jackknife import jackknife_error
+from mitransient_lidar.analysis.information.errors import jackknife_error
 from mitransient_lidar.analysis.retrieval.column_retrieval import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Instrument, Numbers, Option, Scene, Seed, checked, positive_option

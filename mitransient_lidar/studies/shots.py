@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import mitsuba as mi
 import numpy as np
@@ -26,9 +26,6 @@ from mitransient_lidar.rendering.shots.truth import SLOPE_KINDS, SeaMap, Shot, f
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.geometry import lidar_geometry
 from mitransient_lidar.transport.sensor.receiver import Receiver
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 _MOST_MAPPED_PIXELS = 64  #: Largest number of pixels whose footprints are mapped.
 

@@ -23,7 +23,7 @@ from mitransient_lidar.analysis.detection.statistics import (
     sample_moments,
     within_range,
 )
-from mitransient_lidar.analysis.jackknife import jackknife_error
+from mitransient_lidar.analysis.information.errors import jackknife_error
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 

@@ -1,4 +1,7 @@
-"""Errors of fitted parameters, for sample errors that neighbours share, and the chi-squared of a fit."""
+"""Errors of fitted parameters, for sample errors that neighbours share, the chi-squared of a fit, and jackknife errors.
+
+Jackknife estimates of standard errors: Efron and Stein (1981), doi:10.1214/aos/1176345462.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,13 @@ import numpy as np
 
 from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.receiver.electronics import Digitiser
+
+
+def jackknife_error(values: FloatArray) -> float:
+    """Return an estimate's standard error from its values without each of the groups, shape (groups,)."""
+    count = len(values)
+    return math.sqrt((count - 1) / count * float(np.sum((values - values.mean()) ** 2)))
+
 
 _DEGENERATE = 0.999  # correlation between two parameters above which only one combination is known
 _SMOOTHED = 9  # samples over which variances are smoothed

@@ -16,7 +16,7 @@ import xarray as xr
 from scipy.linalg import solve_triangular
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.jackknife import jackknife_error
+from mitransient_lidar.analysis.information.errors import jackknife_error
 from mitransient_lidar.analysis.receiver import PixelChain, pixel_chains
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import limits

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mitransient_lidar.analysis.jackknife import jackknife_error
+from mitransient_lidar.analysis.information.errors import jackknife_error
 from mitransient_lidar.core.tables.written import table_lines, write_csv
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.studies.shots import highest_of
