@@ -74,8 +74,7 @@ class SampledBSDF(mi.BSDF):
         return self.eval_pdf(ctx, si, wo, active)[1]
 
 
-#: Particle parameters.
-_PARTICLES = ("lobe_asymmetry", "backward_share", "opposition_amplitude", "opposition_width")
+_PARTICLES = ("lobe_asymmetry", "backward_share", "opposition_amplitude", "opposition_width")  #: Particle parameters.
 
 
 class Sediment(SampledBSDF):

@@ -199,8 +199,7 @@ def distortions(system: Any, longitude: FloatArray, latitude: FloatArray) -> tup
 #: Value of ASCII grid cells without a height, if the header does not name another, and of empty BAG cells.
 _ASCII_EMPTY, _BAG_EMPTY = -9999.0, 1e6
 
-#: Relative difference between a cell and the no-height value: it may be written with six digits.
-_ROUNDED = 1e-5
+_ROUNDED = 1e-5  #: Relative difference between a cell and the no-height value: it may be written with six digits.
 
 _HIGHEST = 12_000.0  #: Largest distance of heights from the mean sea level [m]: deeper than any sea.
 

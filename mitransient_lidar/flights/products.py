@@ -38,8 +38,7 @@ _CERTAIN = 0.9  #: Probability of a class below which it is uncertain.
 #: Rows of the printed table that are left out without points.
 _IF_ANY = ("land", "above the water", "bottom, merged", "withheld")
 
-#: Store of the infrared channel with lines of its own, beside that of the flight.
-INFRARED_STORE = "infrared.zarr"
+INFRARED_STORE = "infrared.zarr"  #: Store of the infrared channel with lines of its own, beside that of the flight.
 
 #: Variables of the store that tell the truth of a shot, and their names among those of points.
 _TRUTH = ("true_surface_height", "true_bottom_depth", "true_bottom_depth_below_surface")

@@ -21,8 +21,7 @@ _MOST_NEIGHBOURS, _ROWS = 24, 20_000  #: Most points of a plane, and rows in mem
 _SAMPLES, _RESIDUALS = 1000, 2.0 ** np.arange(-8, 1)
 #: Wave number of the waves that planes do not follow, times the root mean square distance of a plane's points.
 _WAVE_NUMBER = 1.5
-#: Probability of a smaller variance of heights than that of the points, one standard deviation below.
-_CHANCE = 0.16
+_CHANCE = 0.16  #: Probability of a smaller variance of heights than that of the points, one standard deviation below.
 #: Smallest standard deviations of heights [m] and slopes [1], so that precise points have finite weights.
 _LEAST_ERROR, _LEAST_SLOPE = 1e-6, 1e-9
 

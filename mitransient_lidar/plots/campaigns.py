@@ -24,9 +24,7 @@ from mitransient_lidar.plots import drawing, palette
 _SAMPLE, _MOST_PARAMETERS, _MOST_PAIRS, _MOST_RUNS = 12, 5, 3, 20_000
 
 _CELLS = 10  #: Cells per side of a response surface.
-
-#: Range drawn below the peak, for powers and for noisy signals.
-_DYNAMIC_RANGE = {"waveform": 1e6, "signal": 1e4}
+_DYNAMIC_RANGE = {"waveform": 1e6, "signal": 1e4}  #: Range drawn below the peak, for powers and for noisy signals.
 
 _NO_ECHO = 1  #: Flag of `analysis.waveforms.echo_detection.EchoFlag` for an echo that was not found.
 

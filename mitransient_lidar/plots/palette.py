@@ -25,9 +25,7 @@ CATEGORIES = RED, GREEN, BLUE, BLACK, ORANGE, SKY, PURPLE = (
 GREY = "#777777"
 
 BEAM, VIEW, SEA, BOTTOM, TARGET, LAYER = ORANGE, BLACK, SKY, RED, PURPLE, GREY  #: Parts of a scene.
-
-#: Components of the received light.
-ORIGINS = {"surface": SKY, "water": BLUE, "bottom": BOTTOM, "target": TARGET}
+ORIGINS = {"surface": SKY, "water": BLUE, "bottom": BOTTOM, "target": TARGET}  #: Components of the received light.
 
 #: Points of a flight.
 CLASSES = {

@@ -284,8 +284,7 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
     return drawing.save(figure, path)
 
 
-#: Pixels above which their sum is drawn: a curve of each would take minutes, and hide the others.
-_MOST_CURVES = 64
+_MOST_CURVES = 64  #: Pixels above which their sum is drawn: a curve of each would take minutes, and hide the others.
 
 _MARK_EVERY = 12  #: Bins from one marker on a curve to the next one.
 

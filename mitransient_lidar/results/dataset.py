@@ -29,8 +29,7 @@ from mitransient_lidar.results.geometry import optional_number
 
 _LOG = logging.getLogger(__name__)
 
-#: Variables in a result.
-LIGHT = ("impulse_response", "impulse_response_stderr", "waveform", "waveform_stderr")
+LIGHT = ("impulse_response", "impulse_response_stderr", "waveform", "waveform_stderr")  #: Variables in a result.
 _TIME_TOLERANCE = 1e-3  # of a bin, between the time coordinate and the attributes
 _NAMED_PIXELS = 5  # largest number of pixels listed in a warning
 

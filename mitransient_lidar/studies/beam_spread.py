@@ -23,8 +23,7 @@ from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 logger = logging.getLogger(__name__)
 
-#: Smallest distance from a plane to the bottom [m], larger than intersection rounding errors.
-_ABOVE_BOTTOM = 1e-3
+_ABOVE_BOTTOM = 1e-3  #: Smallest distance from a plane to the bottom [m], larger than intersection rounding errors.
 
 #: Number of radii and delays in the distributions, smallest over largest, and largest share of the light beyond them.
 _STEPS, _SMALLEST, _BEYOND = 160, 1e-3, 2e-3

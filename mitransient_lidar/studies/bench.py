@@ -89,9 +89,7 @@ _COLUMNS = {
 }
 
 LAYOUTS = ("2x2", "8x8", "32x32", "128x128", "256x256")  #: Layouts whose cost is measured.
-
-#: Median relative error over the lit pixels of the gate on the bottom at which a render ends.
-TARGET_ERROR = 0.1
+TARGET_ERROR = 0.1  #: Median relative error over the lit pixels of the gate on the bottom at which a render ends.
 
 _LIT = 0.05  #: A pixel is lit with this share of the brightest energy (99th percentile).
 

@@ -68,9 +68,7 @@ _LEVEL = 0.6
 
 _FURTHER, _GRAZING = 5.0, 60.0  #: Difference of the second angle [degree], and angle from which it is less.
 _NEAR = 0.5  #: Distance from the bottom within which its signal is the largest [m].
-
-#: Signal-to-noise ratio of bright bottoms, and largest error of their depths [m].
-_BRIGHT, _RIGHT = 10.0, 2.0
+_BRIGHT, _RIGHT = 10.0, 2.0  #: Signal-to-noise ratio of bright bottoms, and largest error of their depths [m].
 
 #: Attributes of renders that do not depend on angle, wind, water and depth.
 _GEOMETRY = ("altitude", "divergence_mrad", "refractive_index")

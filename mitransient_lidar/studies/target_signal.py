@@ -27,8 +27,7 @@ from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.transport.paths.passes import LidarIntegrator, PassRenderer
 from mitransient_lidar.transport.solids import shape_groups
 
-#: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
-_HALF_GATE = 1.0
+_HALF_GATE = 1.0  #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
 
 _GROUPS = 16  #: Jackknife pass groups.
 

@@ -182,8 +182,7 @@ _TILED, _DEEP, _SEVERAL = 0x200, 0x800, 0x1000
 #: Bytes per sample for the types UINT, HALF and FLOAT, and within PXR24 data.
 _SAMPLE_BYTES, _PXR24_BYTES = (4, 2, 4), (4, 2, 3)
 
-#: Longest name of an attribute or a channel, and largest header [bytes].
-_LONGEST_NAME, _LARGEST_HEADER = 255, 2**28
+_LONGEST_NAME, _LARGEST_HEADER = 255, 2**28  #: Longest name of an attribute or a channel, and largest header [bytes].
 
 
 @dataclass(frozen=True)

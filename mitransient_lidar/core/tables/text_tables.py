@@ -34,8 +34,7 @@ logger = logging.getLogger(__name__)
 #: Words for a missing value, in small letters: pandas' own, and dashes.
 MISSING = frozenset({"", "nan", "-nan", "na", "n/a", "<na>", "#n/a", "#na", "null", "none", "-", "--", "---"})
 
-#: Values that instruments write for missing ones.
-_FILL_VALUES = (-99.0, -999.0, -9999.0, -99999.0, -9.99e-29)
+_FILL_VALUES = (-99.0, -999.0, -9999.0, -99999.0, -9.99e-29)  #: Values that instruments write for missing ones.
 
 _MOST_LINES = 10**6  #: Most lines in a table.
 _LINES_FOR_WIDTH = 10_000  #: Lines in which the number of columns shows.
@@ -46,8 +45,7 @@ _COMMENT = re.compile(r"(#(?!N/?A)|%|//|!)[#%/!]*\s*")
 _INLINE_COMMENT = re.compile(r"#(?!N/?A).*")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
-#: Blanks in a heading that do not stand before a unit.
-_BETWEEN_NAMES = re.compile(r"\s+(?![\[(]|1/\w|m\^?-1|in\s)")
+_BETWEEN_NAMES = re.compile(r"\s+(?![\[(]|1/\w|m\^?-1|in\s)")  #: Blanks in a heading that do not stand before a unit.
 
 
 class Table(NamedTuple):

@@ -158,9 +158,7 @@ Interpolation = Literal["linear", "cubic"]
 _DENSE_S, _FEWEST_DENSE = 1.0 + 1e-6, 3
 
 _MOST_PULSES = 10**8  #: Most pulses of a flight.
-
-#: Pulses later than the end of a line by less than this part of their interval belong to it.
-_LAST_PULSE = 1e-6
+_LAST_PULSE = 1e-6  #: Pulses later than the end of a line by less than this part of their interval belong to it.
 
 
 @dataclass(frozen=True, eq=False)

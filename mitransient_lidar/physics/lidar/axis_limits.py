@@ -23,20 +23,15 @@ COLUMN_LEVEL, SOLID_LEVEL = 1e-6, 1e-12
 #: energy arrives later.
 _SHALLOW, _LATER_NS, _LATER_SHARE = 4.0, 40.0, 0.25
 
-#: Largest distance from the beam at which the time of the way from it is added for the view [m].
-_FARTHEST = 10.0
+_FARTHEST = 10.0  #: Largest distance from the beam at which the time of the way from it is added for the view [m].
 
 #: Horizontal distance from the lines of sight, over the depth, within which waves and scattering light a solid.
 _REACH_PER_DEPTH = 0.3
 
 _NARROWINGS = 6  #: Largest number of times that the height range of a solid in view is narrowed.
 _EDGE, _CIRCLES = 128, 8  #: Directions at a cone's edge, and circles of such directions within it.
-
-#: A bottom that ends this share of its lines of sight makes the water below it count no more.
-_COVERED = 0.98
-
-#: Greatest height of the plane of the earliest light, relative to the lower instrument's altitude.
-_HIGHEST = 0.9
+_COVERED = 0.98  #: A bottom that ends this share of its lines of sight makes the water below it count no more.
+_HIGHEST = 0.9  #: Greatest height of the plane of the earliest light, relative to the lower instrument's altitude.
 
 _NS_PER_M = 1e9 / C0
 

@@ -36,8 +36,7 @@ from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.piecewise_linear import first_crossing, integral
 
-#: Points in a weight table per shortest time scale, and largest number of points.
-_POINTS, _MOST_POINTS = 128, 2**17
+_POINTS, _MOST_POINTS = 128, 2**17  #: Points in a weight table per shortest time scale, and largest number of points.
 
 #: Full length of a raised-cosine edge over its 10-90 % time: sin^2 passes 0.1 and 0.9 at 0.2048 and 0.7952 of it.
 _EDGE_PER_RISE = float(np.pi / (np.pi - 2 * np.arccos(0.8)))
@@ -324,8 +323,7 @@ class GatePlan:
     """Gates of a scene: a train whose start is replaced by one given in time, in depth or in range."""
 
     train: GateTrain
-    #: Name of the film parameter: ``gate_start_ns``, ``gate_start_depth`` or ``gate_start_range``.
-    given: str
+    given: str  #: Name of the film parameter: ``gate_start_ns``, ``gate_start_depth`` or ``gate_start_range``.
     #: Its value: half-height time of the first gate's rising edge [ns]; or the depth below the mean sea level, or range
     #: from the lidar [m], from which echoes on the receiver's axis arrive then.
     start: float

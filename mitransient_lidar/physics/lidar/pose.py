@@ -12,9 +12,7 @@ from mitransient_lidar.core.parameters.lidar import LIDAR_TRANSMITTER
 from mitransient_lidar.core.validation import FloatArray, IntArray, in_range
 
 _NEAREST = 0.1  #: Smallest distance of a pose from the mean sea level [m].
-
-#: Distance from a pose under water at which its axis stands for its beam or view [m].
-_UNDER_WATER_RANGE = 10.0
+_UNDER_WATER_RANGE = 10.0  #: Distance from a pose under water at which its axis stands for its beam or view [m].
 
 _SMALLEST_DESCENT = 1e-3  #: Vertical component of an axis below which it is taken as level.
 _SMALLEST_AZIMUTH = 1e-9  #: Horizontal component of an axis below which it has no azimuth.

@@ -14,9 +14,7 @@ from mitransient_lidar.core.validation import FloatArray
 
 MOST_BINS = 1_000_000  #: Largest number of bins.
 LONGEST_NS = 1e7  #: Longest time axis of automatic length [ns], in which light travels 3000 km.
-
-#: Parts of a fitted time axis, at least, between the readable times at which it may start and end.
-_PARTS = 20
+_PARTS = 20  #: Parts of a fitted time axis, at least, between the readable times at which it may start and end.
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,7 @@ from mitransient_lidar.core.validation import FloatArray, finite, positive
 logger = logging.getLogger(__name__)
 
 UNEVENNESS = 1e-3  #: Relative tolerance of even spacing, for 32-bit numbers and rounded decimals.
-
-#: Most scattered points, whose triangulation takes a kilobyte and 10 microseconds each.
-_MOST_SCATTERED = 2 * 10**6
+_MOST_SCATTERED = 2 * 10**6  #: Most scattered points, whose triangulation takes a kilobyte and 10 microseconds each.
 
 _LEAST_SHARE = 0.25  #: Least share of grid cells with a point for points to count as a grid.
 

@@ -30,8 +30,7 @@ from mitransient_lidar.physics.sea.height_files import (
 
 logger = logging.getLogger(__name__)
 
-#: Farthest distance of x = y = 0 from a map [m]: single precision resolves a millimetre there.
-_FARTHEST = 1e4
+_FARTHEST = 1e4  #: Farthest distance of x = y = 0 from a map [m]: single precision resolves a millimetre there.
 
 _Given = tuple[str | None, str | None, float | None]
 """Sign, unit and no-data value for `heights_in_metres`."""

@@ -109,9 +109,7 @@ _SIZE_PER_FOOTPRINT, SIZE_MARGIN = 1.25, 8.0
 _LEAST_SURFACE, _SURFACE_PER_SIZE = 1000.0, 2.0
 
 _BEAM_HALF_WIDTH = 3.0  #: Half angle of a beam, in standard deviations.
-
-#: Full angles [rad] of beam and field of view unless they are given.
-_DIVERGENCE, _FIELD_OF_VIEW = 10e-3, 30e-3
+_DIVERGENCE, _FIELD_OF_VIEW = 10e-3, 30e-3  #: Full angles [rad] of beam and field of view unless they are given.
 
 
 @dataclass(frozen=True)

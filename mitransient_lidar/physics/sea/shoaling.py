@@ -13,8 +13,7 @@ from mitransient_lidar.physics.sea.realization import Interpolation, PeriodicHei
 from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.wind_spectra import ShallowSpectrum, SwellSpectrum
 
-#: Largest significant height of waves (four standard deviations) over the local depth.
-HEIGHT_PER_DEPTH = 0.5
+HEIGHT_PER_DEPTH = 0.5  #: Largest significant height of waves (four standard deviations) over the local depth.
 
 #: Ratio between the wavenumbers of neighbouring bands, the first over the peak wavenumber, and the last [rad/m].
 _BAND, _FIRST_BAND, _LAST_BAND = math.sqrt(2), 0.25, 2 * math.pi

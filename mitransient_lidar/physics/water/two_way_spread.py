@@ -19,8 +19,7 @@ from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 
-#: Least downward component of a direction: light that is more nearly level leaves beam and view.
-_LEVEL = 0.01
+_LEVEL = 0.01  #: Least downward component of a direction: light that is more nearly level leaves beam and view.
 
 _MOST_EVENTS = 200  #: Largest number of events of a way.
 

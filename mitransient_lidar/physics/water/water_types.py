@@ -40,9 +40,7 @@ GREEN_RANGE = (531.0, 533.0)
 _PETZOLD_RANGE = (514.0, GREEN_RANGE[1])
 
 _DISSOLVED_SLOPE = 0.014  #: Decay of the absorption by dissolved matter with the wavelength [1/nm].
-
-#: Nodes of the table that integrates a measured phase function; 822 lie in the backward hemisphere.
-_NODES = 32768
+_NODES = 32768  #: Nodes of the table that integrates a measured phase function; 822 lie in the backward hemisphere.
 
 #: b, bb and the scattering by molecules bw [1/m].
 Scattered = tuple[float, float, float]

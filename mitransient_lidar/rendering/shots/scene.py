@@ -159,8 +159,7 @@ PILOTS, _WITHIN = 128, 200.0  #: Most pilot shots, and farthest place of theirs 
 #: Passes of pilot shots by merging and by light maps, and the relative error for which a merged pass has paths.
 MERGED_PASSES, _MAP_PASSES, _ERROR = 4, 2, 0.1
 
-#: Ratio whose multiples spread over a circle evenly, however many they are.
-_GOLDEN = 0.5 + 0.5 * math.sqrt(5)
+_GOLDEN = 0.5 + 0.5 * math.sqrt(5)  #: Ratio whose multiples spread over a circle evenly, however many they are.
 
 
 def pilot_sea(sea: SeaSurface | None, count: int) -> tuple[FloatArray, FloatArray] | None:

@@ -41,8 +41,7 @@ from mitransient_lidar.transport.sensor.outlines import enclosed_area
 #: Quantities by their names.
 Quantities = dict[str, Measured]
 
-#: Depths between which the decay of the backscatter is fitted, and backscatter is compared [m].
-_COLUMN = (2.0, 6.5)
+_COLUMN = (2.0, 6.5)  #: Depths between which the decay of the backscatter is fitted, and backscatter is compared [m].
 
 _LEAST_FIELD_OF_VIEW = 0.010  #: Least field of view in the publication's table 1 [rad].
 

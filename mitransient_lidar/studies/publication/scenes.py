@@ -30,9 +30,7 @@ _LOG = logging.getLogger(__name__)
 
 REPEATS = 8  #: Renders of a place with independent random numbers, from whose spread standard errors come.
 SEAS = (1, 2, 3)  #: Seas for the other locations, as values of ``surface_seed``.
-
-#: Locations on each sea: random ones, and those with each shot's slopes.
-RANDOM_PLACES, PLACES_OF_SLOPE = 12, 5
+RANDOM_PLACES, PLACES_OF_SLOPE = 12, 5  #: Locations on each sea: random ones, and those with each shot's slopes.
 
 RANDOM = f"{RANDOM_PLACES * len(SEAS)} random places on {len(SEAS)} seas"  #: Random places in words.
 

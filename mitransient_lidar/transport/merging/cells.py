@@ -24,9 +24,7 @@ _MOST_GROWTH = 4.0  #: Largest growth of cell width with depth.
 _THICKNESS_PER_DEPTH = 0.25
 
 _LEAST_THICKNESS = 0.01  #: Least thickness of the uppermost layer, over the final one.
-
-#: Least vertical component of the directions along which points move to their layer's plane.
-_LEAST_DESCENT = 0.5
+_LEAST_DESCENT = 0.5  #: Least vertical component of the directions along which points move to their layer's plane.
 
 #: Least thickness of a cell that a solid cuts relative to a whole one, and in water that is no deeper than one cell.
 _LEAST_CUT, _LEAST_WEDGE = 0.25, 0.01
@@ -329,8 +327,7 @@ def low_bits(number: mi.UInt32, bits: int) -> mi.UInt32:
 #: Angular ring width, over the beam's standard deviation within two of them, and over the angle farther outside.
 _RING_PER_SPREAD, _CORE_SPREADS = 0.1, 2.0
 
-#: Largest thickness of a shell over its radius: the light decreases by its square.
-_THICKNESS_PER_RADIUS = 0.04
+_THICKNESS_PER_RADIUS = 0.04  #: Largest thickness of a shell over its radius: the light decreases by its square.
 
 _SMALLEST_RADIUS = 1e-3  #: Smallest shell radius [m].
 

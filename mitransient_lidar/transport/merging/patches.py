@@ -29,8 +29,7 @@ _STEEP = 0.3
 #: Least foreshortening of surfaces: below it, light is not evened out between points in a patch.
 _LEAST_FORESHORTENING = 0.02
 
-#: Number of rays at each of several locations that find solids with several levels.
-_PROBE_RAYS_OF_SHOTS = 512
+_PROBE_RAYS_OF_SHOTS = 512  #: Number of rays at each of several locations that find solids with several levels.
 
 _MOST_LEVELS = 8  #: Largest number of hits per vertical ray in the search for solids with several levels.
 

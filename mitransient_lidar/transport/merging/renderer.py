@@ -38,9 +38,7 @@ _PHOTONS_FOR_IMAGES = 2**16
 _PATHS_PER_COMPLEMENT_PATH = 16
 
 _COMPLEMENT_PATHS = 1024  # least number of path tracer paths in a pass over all shots
-
-#: Expected points on a light path, relative to a straight one, to scale the connection rate.
-_POINTS_OF_LIGHT = 0.8
+_POINTS_OF_LIGHT = 0.8  #: Expected points on a light path, relative to a straight one, to scale the connection rate.
 
 _CAPACITY_MARGIN = 1.25  #: Capacity for segments and hits over the need of the last pass.
 

@@ -16,11 +16,8 @@ from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.transport.medium.water import refract
 from mitransient_lidar.transport.opaque import aligned, changed, opaque
 
-#: Growth of the core radius with depth [m/m], as light spreads by ripples and scattering.
-_CORE_PER_METRE = 0.05
-
-#: Least cosine of the axis with the vertical, for axes close to the horizon and above it.
-_SMALLEST_COSINE = 0.01
+_CORE_PER_METRE = 0.05  #: Growth of the core radius with depth [m/m], as light spreads by ripples and scattering.
+_SMALLEST_COSINE = 0.01  #: Least cosine of the axis with the vertical, for axes close to the horizon and above it.
 
 _LARGEST_SLANT = 2.0  #: Largest slope of the axis against the vertical along which patches are projected.
 CORE_PER_SPREAD = 2.0  #: Core radius at the surface over the beam's standard deviation there.

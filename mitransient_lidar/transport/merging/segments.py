@@ -42,8 +42,7 @@ _FIELDS = {
 }
 
 
-#: Neighbouring paths that are stored together: the sets of the receiver's samples take turns.
-PATHS_OF_GROUP = 4
+PATHS_OF_GROUP = 4  #: Neighbouring paths that are stored together: the sets of the receiver's samples take turns.
 
 
 class SegmentBuffer:

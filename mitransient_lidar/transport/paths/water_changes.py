@@ -21,9 +21,7 @@ _STEP = 1e-4
 
 _FOCUSING_STEP = 0.02  #: Step for the ripple factors, which are sample means.
 _COSINE_SHARE = 0.25  #: Longest step of a mean cosine g over 1 - |g|.
-
-#: Largest derivative of ln p by a logarithmic parameter that counts as none: table rounding.
-_NEGLIGIBLE = 1e-6
+_NEGLIGIBLE = 1e-6  #: Largest derivative of ln p by a logarithmic parameter that counts as none: table rounding.
 
 
 def coefficient_derivative(water: Water, name: str, layer: int, focusing: RippleFocusing | None = None) -> Perturbation:

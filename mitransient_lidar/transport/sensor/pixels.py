@@ -30,9 +30,7 @@ _LARGEST_LAYOUT = 16  #: Layouts of more pixels than this are imagers by default
 MOST_PIXELS, _MOST_OF_LAYOUT = 2**20, 2**22
 
 _OVERLAP_POINTS = 4096  #: Points in each pixel that find overlaps.
-
-#: Cells of the table along a side for each pixel along a side, and at most.
-_CELLS_PER_PIXEL, _MOST_CELLS = 8, 256
+_CELLS_PER_PIXEL, _MOST_CELLS = 8, 256  #: Cells of the table along a side for each pixel along a side, and at most.
 
 
 class PixelArray(ABC):
