@@ -9,13 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters.water import (
-    FOURNIER_FORAND,
-    MEASURED_PHASE,
-    PETZOLD,
-    SEA_WATER,
-    TWO_TERM_HENYEY_GREENSTEIN,
-)
+from mitransient_lidar.core.parameters import water
 from mitransient_lidar.physics.water.phase import (
     PETZOLD_WATERS,
     fournier_forand_backscatter_ratio,
@@ -27,13 +21,7 @@ from mitransient_lidar.physics.water.phase import (
 from mitransient_lidar.physics.water.phase_table import PowerLawTable, read_phase_table
 from mitransient_lidar.physics.water.seawater import water_phase_function
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
-from mitransient_lidar.transport.medium.tabulated_phase import (
-    NumberedPhase,
-    TabulatedPhase,
-    deflect,
-    henyey_greenstein,
-    sample_henyey_greenstein,
-)
+from mitransient_lidar.transport.medium import tabulated_phase
 
 
 @closed
@@ -42,15 +30,15 @@ class TabulatedPhaseFunction(mi.PhaseFunction):
 
     def __init__(self, props: mi.Properties, table: PowerLawTable) -> None:
         super().__init__(props)
-        self.tabulated = self.functions = TabulatedPhase(table)
+        self.tabulated = self.functions = tabulated_phase.TabulatedPhase(table)
         self.number = mi.UInt32(0)
         self.backscatter_ratio = table.backscatter_ratio
         self.m_flags = mi.PhaseFunctionFlags.Anisotropic.value
 
-    eval_pdf, sample = NumberedPhase.eval_pdf, NumberedPhase.sample
+    eval_pdf, sample = tabulated_phase.NumberedPhase.eval_pdf, tabulated_phase.NumberedPhase.sample
 
 
-@register("phase", FOURNIER_FORAND)
+@register("phase", water.FOURNIER_FORAND)
 class FournierForand(TabulatedPhaseFunction):
     r"""Fournier-Forand phase function (``fournier_forand``).
 
@@ -85,7 +73,7 @@ logger = logging.getLogger(__name__)
 _TOLERATED = 0.02  #: Largest relative normalisation error without a warning.
 
 
-@register("phase", MEASURED_PHASE)
+@register("phase", water.MEASURED_PHASE)
 class MeasuredPhase(TabulatedPhaseFunction):
     r"""Measured phase function (``measured_phase``).
 
@@ -114,7 +102,7 @@ class MeasuredPhase(TabulatedPhaseFunction):
 _AVERAGE = "average_particle"
 
 
-@register("phase", PETZOLD)
+@register("phase", water.PETZOLD)
 class Petzold(TabulatedPhaseFunction):
     r"""Petzold's measured phase functions (``petzold``).
 
@@ -137,7 +125,7 @@ class Petzold(TabulatedPhaseFunction):
         super().__init__(props, PowerLawTable.from_function(measured))
 
 
-@register("phase", SEA_WATER)
+@register("phase", water.SEA_WATER)
 class SeaWater(TabulatedPhaseFunction):
     r"""Phase function of pure sea water (``sea_water``).
 
@@ -157,7 +145,7 @@ class SeaWater(TabulatedPhaseFunction):
         super().__init__(props, PowerLawTable.from_function(phase))
 
 
-@register("phase", TWO_TERM_HENYEY_GREENSTEIN)
+@register("phase", water.TWO_TERM_HENYEY_GREENSTEIN)
 @closed
 class TwoTermHenyeyGreenstein(mi.PhaseFunction):
     r"""Two-term Henyey-Greenstein phase function (``two_term_henyey_greenstein``).
@@ -196,11 +184,13 @@ class TwoTermHenyeyGreenstein(mi.PhaseFunction):
         active: mi.Bool = True,
     ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
         """Sample a direction distributed as the phase function."""
-        forward, backward = (sample_henyey_greenstein(sample2.x, g) for g in (self.g_forward, -self.g_backward))
+        forward, backward = (
+            tabulated_phase.sample_henyey_greenstein(sample2.x, g) for g in (self.g_forward, -self.g_backward)
+        )
         cosine = dr.select(sample1 < self.weight, forward, backward)
-        wo = deflect(mi.Frame3f(-mei.wi), 0.5 * (1 - cosine), dr.two_pi * sample2.y)
+        wo = tabulated_phase.deflect(mi.Frame3f(-mei.wi), 0.5 * (1 - cosine), dr.two_pi * sample2.y)
         return wo, mi.Spectrum(1), self._value(cosine)
 
     def _value(self, cosine: mi.Float) -> mi.Float:
-        forward, backward = (henyey_greenstein(cosine, g) for g in (self.g_forward, -self.g_backward))
+        forward, backward = (tabulated_phase.henyey_greenstein(cosine, g) for g in (self.g_forward, -self.g_backward))
         return self.weight * forward + (1 - self.weight) * backward

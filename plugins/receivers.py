@@ -11,6 +11,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.lidar import MULTIPIXEL_RECEIVER, PIXEL_FOV
 from mitransient_lidar.core.validation import finite_array, in_range
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, read_pose, refuse_medium, register
+from mitransient_lidar.transport.sensor import receiver
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 from mitransient_lidar.transport.sensor.pixels import (
@@ -21,16 +22,9 @@ from mitransient_lidar.transport.sensor.pixels import (
     ShapedPixels,
     parse_layout,
 )
-from mitransient_lidar.transport.sensor.receiver import (
-    GaussianPointSpread,
-    MeasuredPointSpread,
-    PointSpread,
-    Receiver,
-    ReceiverOptics,
-)
 
 #: Optical parameters of a receiver, in the order of `ReceiverOptics`.
-_OPTICS = tuple(each.name for each in fields(ReceiverOptics))
+_OPTICS = tuple(each.name for each in fields(receiver.ReceiverOptics))
 
 
 @closed
@@ -40,7 +34,9 @@ class ReceiverSensor(mi.Sensor):
     def __init__(self, props: DeclaredProperties, pixels: PixelArray) -> None:
         refuse_medium(props)
         super().__init__(props)
-        self.receiver = Receiver(read_pose(props), ReceiverOptics(*map(props.read, _OPTICS)), pixels, _blur(props))
+        self.receiver = receiver.Receiver(
+            read_pose(props), receiver.ReceiverOptics(*map(props.read, _OPTICS)), pixels, _blur(props)
+        )
         self.m_needs_sample_2 = True
         self.m_needs_sample_3 = self.receiver.blur is not None
 
@@ -55,20 +51,20 @@ class ReceiverSensor(mi.Sensor):
         return mi.ScalarBoundingBox3f()
 
 
-def _blur(props: DeclaredProperties) -> PointSpread | None:
+def _blur(props: DeclaredProperties) -> receiver.PointSpread | None:
     """Return a receiver's point-spread function; None for sharp optics."""
     if "blur_file" not in props:
         if "blur_file_mrad" in props:
             raise UserError("blur_file_mrad is the size of blur_file, which is missing")
         width = props.read("blur_mrad")
-        return GaussianPointSpread(1e-3 * width) if width > 0 else None
+        return receiver.GaussianPointSpread(1e-3 * width) if width > 0 else None
     if "blur_file_mrad" not in props:
         raise UserError("blur_file_mrad is missing: the angle [mrad] over which the image blur_file reaches")
     path = str(props["blur_file"])
     values = read_image("blur_file", path)
     if values.min() < 0 or values.max() <= 0:
         raise UserError(f"blur_file = {path!r} must hold values that are not negative and not all 0")
-    return MeasuredPointSpread(values, 1e-3 * props.read("blur_file_mrad"))
+    return receiver.MeasuredPointSpread(values, 1e-3 * props.read("blur_file_mrad"))
 
 
 @register("sensor", PIXEL_FOV)

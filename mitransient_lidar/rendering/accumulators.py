@@ -16,14 +16,7 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, require_memory
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
-from mitransient_lidar.rendering.accuracy import (
-    ErrorCorrelation,
-    ErrorWindow,
-    LightStatistics,
-    PassStatistics,
-    received_power,
-    smoothing_bias,
-)
+from mitransient_lidar.rendering import accuracy
 from mitransient_lidar.rendering.derivatives import Differences, Parameter
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
@@ -61,7 +54,11 @@ class Light:
 
     def __init__(self, scene: LidarScene, separate: bool) -> None:
         self._scene, self._separate = scene, separate
-        self.whole, self.parts, self.perturbed = LightStatistics(), LightStatistics(), LightStatistics()
+        self.whole, self.parts, self.perturbed = (
+            accuracy.LightStatistics(),
+            accuracy.LightStatistics(),
+            accuracy.LightStatistics(),
+        )
 
     def add(self, energy: FloatArray, perturbed: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Add one pass's energies [J], and perturbed ones with one axis more; return the whole and its power."""
@@ -81,7 +78,7 @@ class Light:
     @functools.cached_property
     def _power_of(self) -> Callable[[FloatArray], FloatArray]:
         """Power [W] of energies [J per bin], after the pulse and the receiver's response."""
-        return received_power(self._scene)
+        return accuracy.received_power(self._scene)
 
     @property
     def arrays(self) -> tuple[FloatArray, ...]:
@@ -108,7 +105,7 @@ class PassAccumulator:
     def __init__(
         self,
         scene: LidarScene,
-        window: ErrorWindow,
+        window: accuracy.ErrorWindow,
         train: GateTrain | None = None,
         origins: Sequence[str] = (),
         parameters: Sequence[Parameter] = (),
@@ -120,12 +117,12 @@ class PassAccumulator:
         tiles: Sequence[range | None] = (None,),
     ) -> None:
         self.scene, self.window, self.train, self._kept, self._smooth = scene, window, train, kept, smooth
-        self._light, self._correlation = Light(scene, bool(origins)), ErrorCorrelation()
+        self._light, self._correlation = Light(scene, bool(origins)), accuracy.ErrorCorrelation()
         self._origins, self._parameters = list(origins), list(parameters)
         self._scores = sum(one.perturbation is not None for one in self._parameters)
         self._differences = differences
         self._batches: list[FloatArray] = [np.zeros(())] * batches  # power sums of every batch
-        self.gates, self._gate_slopes = PassStatistics(), PassStatistics()
+        self.gates, self._gate_slopes = accuracy.PassStatistics(), accuracy.PassStatistics()
         self.size, self.tiles = size, tiles
         #: Gates that a pass accumulates instead of time bins, or None.
         self.gate_weights: GateWeights | None = None
@@ -145,7 +142,7 @@ class PassAccumulator:
             differences.cut(train)
 
     @property
-    def _received(self) -> PassStatistics:
+    def _received(self) -> accuracy.PassStatistics:
         """Statistics for all kept energy; energy in overlapping gates is added up."""
         return self._light.whole.energy if self._kept == "histograms" else self.gates
 
@@ -207,7 +204,7 @@ class PassAccumulator:
         energy, stderr = self.gates.mean, self.gates.stderr
         change = self._smoothed(energy) - energy
         lit = energy > _LIT * np.nanpercentile(energy, 99, axis=0)
-        return smoothing_bias(change, stderr, energy, lit)
+        return accuracy.smoothing_bias(change, stderr, energy, lit)
 
     def require_light(self, passes: int) -> None:
         """Raise UserError if all passes' record is empty; values that are not finite count as light."""
@@ -305,7 +302,7 @@ def described(parameters: Sequence[Parameter]) -> list[list[Any]]:
 
 def choose_accumulator(
     scene: LidarScene,
-    window: ErrorWindow,
+    window: accuracy.ErrorWindow,
     surface_time_ns: float | None,
     max_memory: float,
     origins: Sequence[str] = (),

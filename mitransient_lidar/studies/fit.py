@@ -15,12 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.information.alignment import (
-    BANDWIDTH,
-    BANDWIDTH_BOUNDS,
-    BANDWIDTH_START,
-    behind_bandwidth,
-)
+from mitransient_lidar.analysis.information import alignment
+from mitransient_lidar.analysis.information.alignment import BANDWIDTH
 from mitransient_lidar.analysis.information.fisher import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.fits import Model, WaveformFit
 from mitransient_lidar.analysis.information.measured import measured, with_waveforms
@@ -148,8 +144,8 @@ def fit(
     if BANDWIDTH in names:
         if found.receiver is not None:
             raise UserError(f"free = {BANDWIDTH} and a receiver, which has its own response, are alternatives")
-        start = {BANDWIDTH: BANDWIDTH_START, **(start or {})}
-        bounds = {BANDWIDTH: BANDWIDTH_BOUNDS, **(bounds or {})}
+        start = {BANDWIDTH: alignment.BANDWIDTH_START, **(start or {})}
+        bounds = {BANDWIDTH: alignment.BANDWIDTH_BOUNDS, **(bounds or {})}
     model = None
     if callable(scene):
         if missing := [name for name in names if name not in (start or {})]:
@@ -172,7 +168,7 @@ def fit(
         bounds = {**model.bounds(), **(bounds or {})}
 
     def light() -> Model:
-        return behind_bandwidth(render_at) if BANDWIDTH in names else render_at
+        return alignment.behind_bandwidth(render_at) if BANDWIDTH in names else render_at
 
     problem = WaveformFit(found, light(), starts, bounds, free_scale=free_scale, free_time=free_time)
     problem.approach(most_renders=most_renders, until=began + limit)

@@ -31,15 +31,9 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.validation import FloatArray, in_range, positive
+from mitransient_lidar.results import geometry
 from mitransient_lidar.results.attributes import flagged, label, made_from
 from mitransient_lidar.results.files import Given, dataset_of
-from mitransient_lidar.results.geometry import (
-    lidar_geometry,
-    lidar_system,
-    required_number,
-    share_in_view,
-    spot_diameter,
-)
 
 _LOG = logging.getLogger(__name__)
 
@@ -81,7 +75,7 @@ def surface_slopes(
     Times come from the ``gaussian`` estimator. A pixel's light is a Gaussian beam inside its outline, or without
     outlines a point at its centre.
     """
-    lidar = lidar_geometry(dataset.attrs)
+    lidar = geometry.lidar_geometry(dataset.attrs)
     if "pixel" not in dataset.dims or dataset.sizes["pixel"] < 2:
         raise UserError("surface slopes need waveforms of at least 2 pixels over the dimension pixel")
     if slope_deviation is not None and wind_speed is not None:
@@ -98,7 +92,7 @@ def surface_slopes(
         scale = surface_inputs.energy_scale(dataset, efficiency)
         measured = surface_inputs.pixel_echoes(echoes, lidar, light)
         lines = surface_inputs.outlines(dataset)
-        beam = 0.5e-3 * required_number(dataset.attrs, "divergence_mrad")
+        beam = 0.5e-3 * geometry.required_number(dataset.attrs, "divergence_mrad")
         sender = SeaLidar(**vars(lidar), beam=beam, pixels=PixelMap.of_outlines(lines))
         sea = surface_slope.slopes_on_sea(measured, sea_shots(sender, *wind), scale)
         per_height = np.array([1, 1, 1 / math.cos(lidar.off_nadir)])
@@ -185,7 +179,7 @@ def bottom(dataset: xr.Dataset, slopes: xr.Dataset, *, efficiency: float | None 
     reflectance scatter over the shots. With at least 8 shots, a correction that increases the reflectance scatter is
     not applied to any, as focusing by waves may have the opposite effect. With fewer shots their scatter is not known.
     """
-    lidar = lidar_geometry(dataset.attrs)
+    lidar = geometry.lidar_geometry(dataset.attrs)
     summed = surface_inputs.summed_pixels(dataset)
     echoes = echo_table.extract(summed, depth_from="mean", layers=2).isel(pixel=0)
     margin = 0.5 * float(echoes.attrs["echo_fwhm_ns"]) * lidar.depth_per_ns
@@ -193,7 +187,7 @@ def bottom(dataset: xr.Dataset, slopes: xr.Dataset, *, efficiency: float | None 
     seabed, column = (echoes.sel(echo=name) for name in ("bottom", "column"))
     seabed = seabed.where(xr.DataArray(flags & ReflectanceFlag.TARGET == 0, dims=seabed["time_ns"].dims))
     time = seabed["time_ns"].values
-    system, share = lidar_system(dataset.attrs, efficiency), share_in_view(dataset)
+    system, share = geometry.lidar_system(dataset.attrs, efficiency), geometry.share_in_view(dataset)
     flags |= np.where(share < bottom_errors.LEAST_SHARE, int(ReflectanceFlag.NO_DIRECT_LIGHT), 0)
     share = np.where(share < bottom_errors.LEAST_SHARE, np.nan, share)
     waveforms = Waveforms.from_dataset(summed, None, None, None, None)
@@ -296,14 +290,14 @@ def water(dataset: xr.Dataset, *, efficiency: float | None = None) -> xr.Dataset
     ``_stderr``, and ``attenuation`` with its bounds ``attenuation_low`` and ``attenuation_high`` [1/m]; see
     `column_retrieval.WaterEstimate`. NaN without a column or where the pixels see less than a twentieth of the beam.
     """
-    lidar = lidar_geometry(dataset.attrs)
+    lidar = geometry.lidar_geometry(dataset.attrs)
     summed = surface_inputs.summed_pixels(dataset)
     end = lidar.surface_time_ns + _DEEPEST_PATH / lidar.metres_per_ns
-    in_range("spot_diameter", spot_diameter(dataset.attrs), column_retrieval.SMALLEST_SPOT, math.inf)
+    in_range("spot_diameter", geometry.spot_diameter(dataset.attrs), column_retrieval.SMALLEST_SPOT, math.inf)
     shallow = summed.isel(time=summed["time"].values < end)
     echoes = echo_table.extract(shallow).isel(pixel=0)
-    column, system = echoes.sel(echo="column"), lidar_system(dataset.attrs, efficiency)
-    share = np.where((seen := share_in_view(dataset)) < bottom_errors.LEAST_SHARE, np.nan, seen)
+    column, system = echoes.sel(echo="column"), geometry.lidar_system(dataset.attrs, efficiency)
+    share = np.where((seen := geometry.share_in_view(dataset)) < bottom_errors.LEAST_SHARE, np.nan, seen)
     waveforms = Waveforms.from_dataset(shallow, None, None, None, None)
     light = scattered_light.of_columns(waveforms, echoes, system, share, dataset)
     decay, decay_error = echoes["attenuation"].values, echoes["attenuation_stderr"].values
@@ -370,7 +364,7 @@ def retrieve(
             efficiency=efficiency,
         )
     parts = [slopes, bottom(dataset, slopes, efficiency=efficiency)]
-    spot = spot_diameter(dataset.attrs)
+    spot = geometry.spot_diameter(dataset.attrs)
     if spot >= column_retrieval.SMALLEST_SPOT:
         parts.append(water(dataset, efficiency=efficiency))
     found = xr.merge(parts, combine_attrs="override", join="exact", compat="override")
@@ -382,7 +376,7 @@ def retrieve(
 
 def _unknown_slopes(dataset: xr.Dataset) -> xr.Dataset:
     """Return the table of `surface_slopes` for a single pixel, which shows the surface height alone."""
-    lidar = lidar_geometry(dataset.attrs)
+    lidar = geometry.lidar_geometry(dataset.attrs)
     echoes = echo_table.extract(dataset, targets=1).isel(pixel=0)
     time, by_noise, by_method = (echoes[f"surface_time_ns{end}"].values for end in ("", "_stderr", "_method_error"))
     distance, error = (0.5e-9 * C0 * one for one in (time, np.hypot(by_noise, by_method)))

@@ -9,13 +9,8 @@ from scipy import sparse
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, non_negative, non_negative_array, positive
+from mitransient_lidar.physics.receiver import detectors
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
-from mitransient_lidar.physics.receiver.detectors import (
-    LinearDetector,
-    SiliconPhotomultiplier,
-    SinglePhotonDetector,
-    photons_per_joule,
-)
 from mitransient_lidar.physics.receiver.electronics import LowPass
 
 _STEP = 1e-3  # events in a cell, or share of the light on a linear detector, in a central difference
@@ -116,15 +111,15 @@ def _step(chain: ReceiverChain, power: FloatArray, change: FloatArray, seconds: 
     if largest == 0:
         return 0.0
     # Linear detectors have no error at any step; the largest loses the fewest digits.
-    if isinstance(chain.detector, LinearDetector):
+    if isinstance(chain.detector, detectors.LinearDetector):
         return float(power.max() or 1.0) / largest
-    photons = largest * seconds * photons_per_joule(chain.wavelength_nm)
+    photons = largest * seconds * detectors.photons_per_joule(chain.wavelength_nm)
     return _STEP * _cells(chain.detector) / photons
 
 
-def _cells(detector: SiliconPhotomultiplier | SinglePhotonDetector) -> int:
+def _cells(detector: detectors.SiliconPhotomultiplier | detectors.SinglePhotonDetector) -> int:
     """Return the number of cells or channels that share the light."""
-    return detector.channels if isinstance(detector, SinglePhotonDetector) else detector.cells
+    return detector.channels if isinstance(detector, detectors.SinglePhotonDetector) else detector.cells
 
 
 def _amplifier_noise(chain: ReceiverChain, samples: int, width: float) -> FloatArray:

@@ -15,17 +15,11 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.water import COEFFICIENTS, LAYERED_WATER, WATER_KINDS
 from mitransient_lidar.core.validation import in_range, non_negative, positive
+from mitransient_lidar.physics.water import seawater
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_water, read_columns
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
-from mitransient_lidar.physics.water.seawater import (
-    VISIBLE_RANGE,
-    WAVELENGTH_RANGE,
-    group_index,
-    refractive_index,
-    water_absorption,
-    water_scattering,
-)
+from mitransient_lidar.physics.water.seawater import water_scattering
 
 _CHLOROPHYLL_RANGE = (0.01, 30.0)  # mg/m^3, in the Case 1 model
 _SECCHI_RANGE = (0.5, 25.0)  # m; above about 30 m the rules give less absorption than pure water has
@@ -129,7 +123,7 @@ def pure_seawater(
     `wavelength_nm`, `temperature`, `salinity`: as in `seawater.water_scattering`: [nm], [degrees C], [per mille].
     """
     b = float(water_scattering(wavelength_nm, temperature, salinity))
-    return InherentProperties(float(water_absorption(wavelength_nm)), b, b / 2, b)
+    return InherentProperties(float(seawater.water_absorption(wavelength_nm)), b, b / 2, b)
 
 
 def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
@@ -183,7 +177,7 @@ def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentP
     of 2.
     """
     c = in_range("concentration", concentration, *_CHLOROPHYLL_RANGE)
-    lam = in_range("wavelength_nm", wavelength_nm, *VISIBLE_RANGE)
+    lam = in_range("wavelength_nm", wavelength_nm, *seawater.VISIBLE_RANGE)
     water = pure_seawater(lam)
     kw, factor, exponent = _case1_terms(lam)
 
@@ -208,9 +202,9 @@ def near_infrared(green: InherentProperties, wavelength_nm: float) -> InherentPr
     by particles are proportional to 1/wavelength (Gordon and Morel 1983); exponents in real waters lie between 0 and 2.
     At 1064 nm this scattering is a hundredth of the attenuation.
     """
-    lam = in_range("wavelength_nm", wavelength_nm, VISIBLE_RANGE[1], WAVELENGTH_RANGE[1])
+    lam = in_range("wavelength_nm", wavelength_nm, seawater.VISIBLE_RANGE[1], seawater.WAVELENGTH_RANGE[1])
     ratio, pure, molecules = 532.0 / lam, pure_seawater(), green.water_scattering
-    found = pure_seawater(lam) if molecules > 0 else InherentProperties(float(water_absorption(lam)), 0.0, 0.0)
+    found = pure_seawater(lam) if molecules > 0 else InherentProperties(float(seawater.water_absorption(lam)), 0.0, 0.0)
     other = max(green.absorption - pure.absorption, 0.0) * np.exp(-_DISSOLVED_SLOPE * (lam - 532.0))
     particles, back = max(green.scattering - molecules, 0.0), max(green.backscattering - molecules / 2, 0.0)
     return InherentProperties(
@@ -234,8 +228,11 @@ def default_water(wavelength_nm: float) -> dict[str, float]:
     These are ``refractive_index`` and ``group_index`` of sea water, 400 to 1100 nm. Above 700 nm they include
     ``attenuation``, ``scattering`` and ``backscattering`` [1/m] of the default 532 nm water (`near_infrared`).
     """
-    found = {"refractive_index": refractive_index(wavelength_nm), "group_index": group_index(wavelength_nm)}
-    if wavelength_nm > VISIBLE_RANGE[1]:
+    found = {
+        "refractive_index": seawater.refractive_index(wavelength_nm),
+        "group_index": seawater.group_index(wavelength_nm),
+    }
+    if wavelength_nm > seawater.VISIBLE_RANGE[1]:
         c, b, bb = (LAYERED_WATER[name].default for name in COEFFICIENTS)
         water = near_infrared(InherentProperties(c - b, b, bb), wavelength_nm)
         found |= {name: getattr(water, name) for name in COEFFICIENTS}
@@ -323,7 +320,7 @@ def water_of(
         return pure_seawater(wavelength_nm, temperature, salinity)
     if value is None:
         raise UserError(f"value is missing: {kind} needs one")
-    if wavelength_nm > VISIBLE_RANGE[1]:
+    if wavelength_nm > seawater.VISIBLE_RANGE[1]:
         return near_infrared(water_of(kind, value), wavelength_nm)
     text = value
     if kind == "jerlov":

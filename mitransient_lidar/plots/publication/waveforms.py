@@ -19,18 +19,7 @@ from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.layout import draw_sea_level
 from mitransient_lidar.plots.studies.shots import draw_sea
 from mitransient_lidar.studies.publication import scenes
-from mitransient_lidar.studies.publication.scenes import (
-    FOUR,
-    LAYOUTS,
-    SHOTS,
-    Renders,
-    System,
-    as_series,
-    geometry_of,
-    outlines,
-    shot_places,
-    three_shots,
-)
+from mitransient_lidar.studies.publication.scenes import Renders
 from mitransient_lidar.studies.publication.statements import change
 from mitransient_lidar.studies.shots import render_found_shots
 
@@ -54,10 +43,10 @@ def draw_waveforms(
 
     `origin` selects the light from one origin, and `pixels` some pixels.
     """
-    series = as_series(result)
+    series = scenes.as_series(result)
     power = series.parts[origin] if origin else series.power
     mean, error = power.mean(axis=0), power.std(axis=0, ddof=1) / np.sqrt(len(power))
-    depth = geometry_of(result).depth_of_time(series.time)
+    depth = scenes.geometry_of(result).depth_of_time(series.time)
     shown = (depth >= limits[0]) & (depth <= limits[1])
     factor, prefix = drawing.si_prefix(float(series.power.mean(axis=0)[:, shown].max()))
     styles = palette.curves(len(mean))
@@ -128,7 +117,7 @@ def layer_zoom(renders: Renders) -> Figure:
     figure = _four_and_one(renders, (scenes.LAYERED_FOUR, scenes.LAYERED_SINGLE), (1.8, 5.0), "16", log=True)
     for ax, scene in zip(figure.axes, (scenes.LAYERED_FOUR, scenes.LAYERED_SINGLE), strict=True):
         result = renders.shot(scene)
-        mean, geometry = as_series(result).mean(), geometry_of(result)
+        mean, geometry = scenes.as_series(result).mean(), scenes.geometry_of(result)
         factor, _ = drawing.si_prefix(float(mean.power[:, geometry.depth_of_time(mean.time) >= 1.8].max()))
         colours = palette.pixel_colours(len(mean.power))
         for pixel, middle in enumerate(scenes.layer_times(result)):
@@ -196,7 +185,7 @@ def surface_echoes(renders: Renders) -> Figure:
     figure = drawing.new_figure(None, 10.4, 6.2)
     axes = figure.subplots(2, 3)
     _draw_places(renders, axes[0], "10")
-    for ax, result, panel in zip(axes[1], three_shots(renders), "bcd", strict=True):
+    for ax, result, panel in zip(axes[1], scenes.three_shots(renders), "bcd", strict=True):
         draw_waveforms(ax, result, (-1.2, 1.2))
         ax.set_title(f"10 ({panel})  surface echo, shot {'bcd'.index(panel) + 1}", fontsize="medium")
     add_pixel_legend(axes[1, 0], "upper left")
@@ -209,7 +198,7 @@ def bottom_echoes(renders: Renders) -> Figure:
     grid = figure.add_gridspec(2, 3)
     _draw_places(renders, [figure.add_subplot(grid[0, number]) for number in range(3)], "11")
     ax = figure.add_subplot(grid[1, :])
-    results = three_shots(renders)
+    results = scenes.three_shots(renders)
     for number, (result, style) in enumerate(zip(results, _STYLES, strict=True), start=1):
         draw_waveforms(ax, result, (4.0, 6.5), pixels=[0], label=f"shot {number}", linestyle=style)
     ax.legend(frameon=False)
@@ -219,7 +208,7 @@ def bottom_echoes(renders: Renders) -> Figure:
 
 def paths(renders: Renders) -> Figure:
     """Draw the paths below the slopes of shots 1 and 3, refracted by Snell's law (figure 12)."""
-    system, places = System.of(SHOTS[0]), shot_places(renders)
+    system, places = scenes.System.of(scenes.SHOTS[0]), scenes.shot_places(renders)
     figure = drawing.new_figure(None, 7.0, 3.6)
     for ax, slope, name in zip(figure.subplots(1, 2), (places[0].along, places[2].along), "AB", strict=True):
         down = np.array([math.sin(system.off_nadir), -math.cos(system.off_nadir)])
@@ -239,8 +228,8 @@ def paths(renders: Renders) -> Figure:
 
 def _draw_places(renders: Renders, axes: Sequence[Axes], number: str) -> None:
     """Draw the sea about each shot, with the footprints of beam and pixels."""
-    places = shot_places(renders)
-    drawn = render_found_shots(renders.session(SHOTS[0]), places, waveforms=False)
+    places = scenes.shot_places(renders)
+    drawn = render_found_shots(renders.session(scenes.SHOTS[0]), places, waveforms=False)
     for index, (ax, shot) in enumerate(zip(axes, places, strict=True)):
         draw_sea(ax, dataclasses.replace(drawn, shots=(shot,)), first=index + 1)
         # Adding 0 turns -0 into 0.
@@ -256,7 +245,7 @@ _HALF_SIDE, _AXES_APART = 1.3, 0.25
 
 def system(_renders: Renders) -> Figure:
     """Draw the lidar, beam and field of view in air and in water, in the incidence plane (figure 5)."""
-    numbers = System.of(FOUR)
+    numbers = scenes.System.of(scenes.FOUR)
     figure = drawing.new_figure(None, 8.0, 4.2)
     left, right = figure.subplots(1, 2)
     origin = np.array([-numbers.height * math.tan(numbers.off_nadir), 0.0, numbers.height])
@@ -298,7 +287,7 @@ def mesh(renders: Renders) -> Figure:
     """Draw axes refracted at sea facets, and the sea's triangles with the footprints (figure 6)."""
     from mitransient_lidar.transport.scene_parts import seas_of
 
-    numbers, session = System.of(FOUR), renders.session(FOUR)
+    numbers, session = scenes.System.of(scenes.FOUR), renders.session(scenes.FOUR)
     sea = seas_of(session.scene)[0].sea
     figure = drawing.new_figure(None, 9.6, 4.6)
     left, right = figure.subplots(1, 2)
@@ -323,7 +312,7 @@ def mesh(renders: Renders) -> Figure:
     return figure
 
 
-def _draw_section(ax: Axes, numbers: System, lines: np.ndarray, heights: np.ndarray) -> None:
+def _draw_section(ax: Axes, numbers: scenes.System, lines: np.ndarray, heights: np.ndarray) -> None:
     """Draw a section of the sea along x, and parallel axes that its facets refract."""
     ax.plot(lines, heights, color=palette.SEA, linewidth=1.6)
     down = np.array([math.sin(numbers.off_nadir), -math.cos(numbers.off_nadir)])
@@ -341,8 +330,8 @@ def _draw_section(ax: Axes, numbers: System, lines: np.ndarray, heights: np.ndar
 def pixels(renders: Renders) -> Figure:
     """Draw the pixels of the three layouts as seen from the lidar (figure 8)."""
     figure = drawing.new_figure(None, 8.4, 3.0)
-    for ax, scene, panel in zip(figure.subplots(1, 3), LAYOUTS, "abc", strict=True):
-        shapes = outlines(renders, scene)
+    for ax, scene, panel in zip(figure.subplots(1, 3), scenes.LAYOUTS, "abc", strict=True):
+        shapes = scenes.outlines(renders, scene)
         for number, (shape, colour) in enumerate(zip(shapes, palette.pixel_colours(len(shapes)), strict=True)):
             for line in shape:
                 # angle_y to the left, angle_x, away from nadir, up.

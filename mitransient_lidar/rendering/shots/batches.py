@@ -19,14 +19,10 @@ from mitransient_lidar.plugins.ocean_surface import SeaPatches
 from mitransient_lidar.rendering.accumulators import Light
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
+from mitransient_lidar.transport.light_maps import suitability
 from mitransient_lidar.transport.light_maps.maps import HeightFields
 from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
-from mitransient_lidar.transport.light_maps.suitability import (
-    REACH_THE_SURFACE,
-    UnsuitedError,
-    light_faintly,
-    over_water,
-)
+from mitransient_lidar.transport.light_maps.suitability import REACH_THE_SURFACE
 from mitransient_lidar.transport.medium.bubbles import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
@@ -398,15 +394,15 @@ def _errors(window: ErrorWindow | None, light: Light) -> FloatArray:
 def suits_maps(lidar: LidarScene, poses: ShotPoses) -> BoolArray:
     """Return which shots in a scene that suits light maps serve: over water, with faint light on targets."""
     places = poses.places - lidar.frame_origin[:2]
-    faint = [light_faintly(lidar, target, places, poses.turns) for target in lidar.targets]
-    return np.asarray(np.all([over_water(lidar, places, poses.turns), *faint], axis=0))
+    faint = [suitability.light_faintly(lidar, target, places, poses.turns) for target in lidar.targets]
+    return np.asarray(np.all([suitability.over_water(lidar, places, poses.turns), *faint], axis=0))
 
 
 def require_water(lidar: LidarScene, poses: ShotPoses) -> None:
     """Raise `UnsuitedError` if light maps do not suit shots, since they meet land, or solids near the surface."""
-    dry = ~over_water(lidar, poses.places - lidar.frame_origin[:2], poses.turns)
+    dry = ~suitability.over_water(lidar, poses.places - lidar.frame_origin[:2], poses.turns)
     if dry.any():
-        raise UnsuitedError(f"{REACH_THE_SURFACE} in {np.count_nonzero(dry)} shots")
+        raise suitability.UnsuitedError(f"{REACH_THE_SURFACE} in {np.count_nonzero(dry)} shots")
 
 
 def share_for_error(error: float) -> float:

@@ -13,13 +13,8 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import require_memory
+from mitransient_lidar.transport.paths import refracted_connection
 from mitransient_lidar.transport.paths.path import ConnectedPath
-from mitransient_lidar.transport.paths.refracted_connection import (
-    EmitterDirection,
-    RefractedSunSampler,
-    connect_sun,
-    level_transmittance,
-)
 from mitransient_lidar.transport.paths.volpath import BYTES_PER_PATH, PathLight, PathTracer, VolpathOptions
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.plugin_types import Daylight, SkyEmitter, SunEmitter, Transmitter
@@ -164,7 +159,7 @@ class DaylightLight(PathLight):
 
     def __init__(self, scene: DaylightScene, received: ReceivedDaylight, u: mi.Point2f, weight: mi.Float) -> None:
         self.scene, self.received, self.weight = scene, received, weight
-        self.sampler = RefractedSunSampler(scene, scene.sun_directions(u))
+        self.sampler = refracted_connection.RefractedSunSampler(scene, scene.sun_directions(u))
         self.invalid = dr.zeros(mi.Bool, dr.width(received.found))
 
     def add(self, path: ConnectedPath, found: mi.Float, active: mi.Bool) -> None:
@@ -178,13 +173,15 @@ class DaylightLight(PathLight):
         dr.scatter_add(self.received.scattered, mi.Float64(found), pixel, diffuse)
 
     def connect(
-        self, si: mi.SurfaceInteraction3f, emitter: EmitterDirection, active: mi.Bool
+        self, si: mi.SurfaceInteraction3f, emitter: refracted_connection.EmitterDirection, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
         """Connect surface points to the sun."""
         sun = self.scene.sun
         if sun is None:
             return mi.Float(0), mi.Float(0)
-        return connect_sun(self.scene, si, emitter.in_air, sun.sampled_irradiance, active), mi.Float(0)
+        return refracted_connection.connect_sun(
+            self.scene, si, emitter.in_air, sun.sampled_irradiance, active
+        ), mi.Float(0)
 
     def receive(
         self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool, sums: Sums
@@ -215,11 +212,11 @@ class DaylightLight(PathLight):
         path.rays += dr.select(active, mi.UInt32(1), 0)
         self.add(path, self.weight * path.throughput * radiance, bright)
 
-    def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
+    def lose(self, emitter: refracted_connection.EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
         """Add sunlight to the losses."""
         sun = self.scene.sun
         if sun is not None:
-            missing = share * level_transmittance(self.scene, emitter) * sun.sampled_irradiance
+            missing = share * refracted_connection.level_transmittance(self.scene, emitter) * sun.sampled_irradiance
             dr.scatter_add(self.received.edge_loss, mi.Float64(missing), mi.UInt32(0), missing > 0)
 
     def end_paths(self, path: ConnectedPath, rng: mi.PCG32) -> None:
