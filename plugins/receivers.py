@@ -11,17 +11,10 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.lidar import MULTIPIXEL_RECEIVER, PIXEL_FOV
 from mitransient_lidar.core.validation import finite_array, in_range
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, read_pose, refuse_medium, register
+from mitransient_lidar.transport.sensor import pixels as arrays
 from mitransient_lidar.transport.sensor import receiver
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.sensor.image_sampling import read_image
-from mitransient_lidar.transport.sensor.pixels import (
-    HexPixels,
-    LayoutPixels,
-    MappedPixels,
-    PixelArray,
-    ShapedPixels,
-    parse_layout,
-)
 
 #: Optical parameters of a receiver, in the order of `ReceiverOptics`.
 _OPTICS = tuple(each.name for each in fields(receiver.ReceiverOptics))
@@ -31,7 +24,7 @@ _OPTICS = tuple(each.name for each in fields(receiver.ReceiverOptics))
 class ReceiverSensor(mi.Sensor):
     """Sensor of some pixels, with pose, optics and blur from its parameters."""
 
-    def __init__(self, props: DeclaredProperties, pixels: PixelArray) -> None:
+    def __init__(self, props: DeclaredProperties, pixels: arrays.PixelArray) -> None:
         refuse_medium(props)
         super().__init__(props)
         self.receiver = receiver.Receiver(
@@ -89,7 +82,7 @@ class PixelFov(ReceiverSensor):
         # Mitsuba gives a sensor without film, as a nested one, its own and warns of its format.
         mi.set_log_level(mi.LogLevel.Error)
         try:
-            super().__init__(props, ShapedPixels([self.field], [self.pixel_name or "pixel"]))
+            super().__init__(props, arrays.ShapedPixels([self.field], [self.pixel_name or "pixel"]))
         finally:
             mi.set_log_level(level)
 
@@ -156,30 +149,30 @@ class MultipixelReceiver(ReceiverSensor):
 _LENS = ("focal_length_mm", "pixel_pitch_um")  #: Lens parameters.
 
 
-def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:
+def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> arrays.PixelArray:
     """Build the pixels from nested sensors."""
     if not all(isinstance(pixel, PixelFov) for pixel in nested):
         raise UserError("multipixel_receiver: nested sensors must be pixel_fov")
     names = [pixel.pixel_name or f"pixel{index}" for index, pixel in enumerate(nested)]
-    return ShapedPixels([pixel.field for pixel in nested], names)
+    return arrays.ShapedPixels([pixel.field for pixel in nested], names)
 
 
-def _own_pixels(props: DeclaredProperties) -> PixelArray:
+def _own_pixels(props: DeclaredProperties) -> arrays.PixelArray:
     """Build the pixels from a layout or a map."""
     field_of_view = 1e-3 * props.read("field_of_view_mrad")
     if "pixel_map" in props:
-        return MappedPixels.from_file(str(props["pixel_map"]), field_of_view)
+        return arrays.MappedPixels.from_file(str(props["pixel_map"]), field_of_view)
     layout, fill_factor, imager = str(props.read("layout")), props.read("fill_factor"), props.read("imager")
     if layout.startswith("hex"):
         for name in ("field_of_view_shape", "imager", *_LENS):
             if name in props:
                 raise UserError(f"{name} = {props[name]!r} is for layouts of rows x columns: leave it out")
-        return HexPixels(layout, field_of_view, fill_factor)
+        return arrays.HexPixels(layout, field_of_view, fill_factor)
     if any(name in props for name in _LENS):
         shape = props.read("field_of_view_shape", "square")
-        return LayoutPixels(layout, _sides_of_lens(props, layout), shape, imager, fill_factor)
+        return arrays.LayoutPixels(layout, _sides_of_lens(props, layout), shape, imager, fill_factor)
     shape = props.read("field_of_view_shape", "circle")
-    return LayoutPixels(layout, field_of_view, shape, imager, fill_factor)
+    return arrays.LayoutPixels(layout, field_of_view, shape, imager, fill_factor)
 
 
 def _sides_of_lens(props: DeclaredProperties, layout: str) -> tuple[float, float]:
@@ -188,7 +181,7 @@ def _sides_of_lens(props: DeclaredProperties, layout: str) -> tuple[float, float
         if name not in props:
             raise UserError(f"{name} is missing: a lens needs {' and '.join(_LENS)}")
     focal_length, pitch = map(props.read, _LENS)
-    rows, columns = parse_layout(layout)
+    rows, columns = arrays.parse_layout(layout)
     sides = 1e-3 * pitch / focal_length * rows, 1e-3 * pitch / focal_length * columns
     allowed = MULTIPIXEL_RECEIVER["field_of_view_mrad"]
     if not allowed.low <= 1e3 * min(sides) <= 1e3 * max(sides) <= allowed.high:
