@@ -9,7 +9,13 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.parameters import water
+from mitransient_lidar.core.parameters.water import (
+    FOURNIER_FORAND,
+    MEASURED_PHASE,
+    PETZOLD,
+    SEA_WATER,
+    TWO_TERM_HENYEY_GREENSTEIN,
+)
 from mitransient_lidar.physics.water.phase import (
     PETZOLD_WATERS,
     fournier_forand_backscatter_ratio,
@@ -38,7 +44,7 @@ class TabulatedPhaseFunction(mi.PhaseFunction):
     eval_pdf, sample = tabulated_phase.NumberedPhase.eval_pdf, tabulated_phase.NumberedPhase.sample
 
 
-@register("phase", water.FOURNIER_FORAND)
+@register("phase", FOURNIER_FORAND)
 class FournierForand(TabulatedPhaseFunction):
     r"""Fournier-Forand phase function (``fournier_forand``).
 
@@ -73,7 +79,7 @@ logger = logging.getLogger(__name__)
 _TOLERATED = 0.02  #: Largest relative normalisation error without a warning.
 
 
-@register("phase", water.MEASURED_PHASE)
+@register("phase", MEASURED_PHASE)
 class MeasuredPhase(TabulatedPhaseFunction):
     r"""Measured phase function (``measured_phase``).
 
@@ -102,7 +108,7 @@ class MeasuredPhase(TabulatedPhaseFunction):
 _AVERAGE = "average_particle"
 
 
-@register("phase", water.PETZOLD)
+@register("phase", PETZOLD)
 class Petzold(TabulatedPhaseFunction):
     r"""Petzold's measured phase functions (``petzold``).
 
@@ -125,7 +131,7 @@ class Petzold(TabulatedPhaseFunction):
         super().__init__(props, PowerLawTable.from_function(measured))
 
 
-@register("phase", water.SEA_WATER)
+@register("phase", SEA_WATER)
 class SeaWater(TabulatedPhaseFunction):
     r"""Phase function of pure sea water (``sea_water``).
 
@@ -145,7 +151,7 @@ class SeaWater(TabulatedPhaseFunction):
         super().__init__(props, PowerLawTable.from_function(phase))
 
 
-@register("phase", water.TWO_TERM_HENYEY_GREENSTEIN)
+@register("phase", TWO_TERM_HENYEY_GREENSTEIN)
 @closed
 class TwoTermHenyeyGreenstein(mi.PhaseFunction):
     r"""Two-term Henyey-Greenstein phase function (``two_term_henyey_greenstein``).
