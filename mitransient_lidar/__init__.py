@@ -55,72 +55,73 @@ if TYPE_CHECKING:
 
     import xarray
 
-    from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
-    from mitransient_lidar.analysis.gates.cut import cut_gates
-    from mitransient_lidar.analysis.gates.range_images import depth_image
-    from mitransient_lidar.analysis.receiver import detect_waveforms as record
-    from mitransient_lidar.analysis.retrieval.retrieve import retrieve
-    from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths
-    from mitransient_lidar.analysis.waveforms.echo_table import extract as echoes
-    from mitransient_lidar.campaigns.sweep import campaign
-    from mitransient_lidar.flights.fly import fly
-    from mitransient_lidar.loading.catalogue import instrument_names, read_instrument, scene_names, scene_parameters
-    from mitransient_lidar.loading.scenes import open_scene
-    from mitransient_lidar.physics.lidar.gate_train import GateTrain
-    from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
-    from mitransient_lidar.physics.water.profiles import read_profile
-    from mitransient_lidar.physics.water.water_types import water_of
-    from mitransient_lidar.plots.publication.figures import figures
-    from mitransient_lidar.plots.viewer import view, view_points, view_scene
-    from mitransient_lidar.rendering.passive import render_passive
-    from mitransient_lidar.rendering.render import render
-    from mitransient_lidar.rendering.shots.frames import render_frames
-    from mitransient_lidar.rendering.shots.series import render_shots
-    from mitransient_lidar.results.waveform_files import waveform_chunks
-    from mitransient_lidar.studies.bounds import bounds
-    from mitransient_lidar.studies.depth_bias import depth_bias, tpu
-    from mitransient_lidar.studies.detection import detect
-    from mitransient_lidar.studies.fit import fit
-    from mitransient_lidar.studies.forecast import forecast
-    from mitransient_lidar.studies.light_classes import scattering
+    from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS as SURVEY_ORDERS
+    from mitransient_lidar.analysis.gates.cut import cut_gates as cut_gates
+    from mitransient_lidar.analysis.gates.range_images import depth_image as depth_image
+    from mitransient_lidar.analysis.receiver import record as record
+    from mitransient_lidar.analysis.retrieval.retrieve import retrieve as retrieve
+    from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths as correct_depths
+    from mitransient_lidar.analysis.waveforms.echo_table import echoes as echoes
+    from mitransient_lidar.campaigns.sweep import campaign as campaign
+    from mitransient_lidar.flights.fly import fly as fly
+    from mitransient_lidar.loading.catalogue import instrument_names as instrument_names
+    from mitransient_lidar.loading.catalogue import read_instrument as read_instrument
+    from mitransient_lidar.loading.catalogue import scene_names as scene_names
+    from mitransient_lidar.loading.catalogue import scene_parameters as scene_parameters
+    from mitransient_lidar.loading.scenes import open_scene as open_scene
+    from mitransient_lidar.physics.lidar.gate_train import GateTrain as GateTrain
+    from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake as kelvin_wake
+    from mitransient_lidar.physics.water.profiles import read_profile as read_profile
+    from mitransient_lidar.physics.water.water_types import water_of as water_of
+    from mitransient_lidar.plots.publication.figures import figures as figures
+    from mitransient_lidar.plots.viewer import view as view
+    from mitransient_lidar.plots.viewer import view_points as view_points
+    from mitransient_lidar.plots.viewer import view_scene as view_scene
+    from mitransient_lidar.rendering.passive import render_passive as render_passive
+    from mitransient_lidar.rendering.render import render as render
+    from mitransient_lidar.rendering.shots.frames import render_frames as render_frames
+    from mitransient_lidar.rendering.shots.series import render_shots as render_shots
+    from mitransient_lidar.results.waveform_files import waveform_chunks as waveform_chunks
+    from mitransient_lidar.studies.bounds import bounds as bounds
+    from mitransient_lidar.studies.depth_bias import depth_bias as depth_bias
+    from mitransient_lidar.studies.depth_bias import tpu as tpu
+    from mitransient_lidar.studies.detection import detect as detect
+    from mitransient_lidar.studies.fit import fit as fit
+    from mitransient_lidar.studies.forecast import forecast as forecast
+    from mitransient_lidar.studies.light_classes import scattering as scattering
 
-#: Functions by the modules that are imported when they are first used.
-_FUNCTIONS = {
-    "GateTrain": ("physics.lidar.gate_train", "GateTrain"),
-    "SURVEY_ORDERS": ("analysis.depth_uncertainty", "SURVEY_ORDERS"),
-    "bounds": ("studies.bounds", "bounds"),
-    "campaign": ("campaigns.sweep", "campaign"),
-    "correct_depths": ("analysis.waveforms.depth_correction", "correct_depths"),
-    "cut_gates": ("analysis.gates.cut", "cut_gates"),
-    "depth_bias": ("studies.depth_bias", "depth_bias"),
-    "depth_image": ("analysis.gates.range_images", "depth_image"),
-    "detect": ("studies.detection", "detect"),
-    "echoes": ("analysis.waveforms.echo_table", "extract"),
-    "figures": ("plots.publication.figures", "figures"),
-    "fit": ("studies.fit", "fit"),
-    "fly": ("flights.fly", "fly"),
-    "forecast": ("studies.forecast", "forecast"),
-    "instrument_names": ("loading.catalogue", "instrument_names"),
-    "kelvin_wake": ("physics.sea.kelvin_wake", "kelvin_wake"),
-    "open_scene": ("loading.scenes", "open_scene"),
-    "read_instrument": ("loading.catalogue", "read_instrument"),
-    "read_profile": ("physics.water.profiles", "read_profile"),
-    "record": ("analysis.receiver", "detect_waveforms"),
-    "render": ("rendering.render", "render"),
-    "render_frames": ("rendering.shots.frames", "render_frames"),
-    "render_passive": ("rendering.passive", "render_passive"),
-    "render_shots": ("rendering.shots.series", "render_shots"),
-    "retrieve": ("analysis.retrieval.retrieve", "retrieve"),
-    "scattering": ("studies.light_classes", "scattering"),
-    "scene_names": ("loading.catalogue", "scene_names"),
-    "scene_parameters": ("loading.catalogue", "scene_parameters"),
-    "tpu": ("studies.depth_bias", "tpu"),
-    "view": ("plots.viewer", "view"),
-    "view_points": ("plots.viewer", "view_points"),
-    "view_scene": ("plots.viewer", "view_scene"),
-    "water_of": ("physics.water.water_types", "water_of"),
-    "waveform_chunks": ("results.waveform_files", "waveform_chunks"),
+#: Public names by the modules that are imported when they are first used.
+_NAMES = {
+    "analysis.depth_uncertainty": "SURVEY_ORDERS",
+    "analysis.gates.cut": "cut_gates",
+    "analysis.gates.range_images": "depth_image",
+    "analysis.receiver": "record",
+    "analysis.retrieval.retrieve": "retrieve",
+    "analysis.waveforms.depth_correction": "correct_depths",
+    "analysis.waveforms.echo_table": "echoes",
+    "campaigns.sweep": "campaign",
+    "flights.fly": "fly",
+    "loading.catalogue": "instrument_names read_instrument scene_names scene_parameters",
+    "loading.scenes": "open_scene",
+    "physics.lidar.gate_train": "GateTrain",
+    "physics.sea.kelvin_wake": "kelvin_wake",
+    "physics.water.profiles": "read_profile",
+    "physics.water.water_types": "water_of",
+    "plots.publication.figures": "figures",
+    "plots.viewer": "view view_points view_scene",
+    "rendering.passive": "render_passive",
+    "rendering.render": "render",
+    "rendering.shots.frames": "render_frames",
+    "rendering.shots.series": "render_shots",
+    "results.waveform_files": "waveform_chunks",
+    "studies.bounds": "bounds",
+    "studies.depth_bias": "depth_bias tpu",
+    "studies.detection": "detect",
+    "studies.fit": "fit",
+    "studies.forecast": "forecast",
+    "studies.light_classes": "scattering",
 }
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 #: Former names of functions, and those that have taken their place.
 _FORMER = {
@@ -133,61 +134,23 @@ _FORMER = {
 }
 
 #: Without `open`, so that ``from mitransient_lidar import *`` leaves the one of Python alone.
-__all__ = [
-    "SURVEY_ORDERS",
-    "GateTrain",
-    "__version__",
-    "bounds",
-    "campaign",
-    "correct_depths",
-    "cut_gates",
-    "depth_bias",
-    "depth_image",
-    "detect",
-    "echoes",
-    "figures",
-    "fit",
-    "fly",
-    "forecast",
-    "instrument_names",
-    "kelvin_wake",
-    "open_scene",
-    "read_instrument",
-    "read_profile",
-    "record",
-    "render",
-    "render_frames",
-    "render_passive",
-    "render_shots",
-    "retrieve",
-    "save",
-    "scattering",
-    "scene_names",
-    "scene_parameters",
-    "tpu",
-    "view",
-    "view_points",
-    "view_scene",
-    "water_of",
-    "waveform_chunks",
-]
+__all__ = [*_MODULES, "__version__", "save"]
 
 
 def __getattr__(name: str) -> Any:
     """Import a function when it is first used."""
     if name in _FORMER:
         raise AttributeError(f"{__name__}.{name} is now {_FORMER[name]}")
-    if name not in _FUNCTIONS:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, function = _FUNCTIONS[name]
-    found = getattr(importlib.import_module(f"{__name__}.{module}"), function)
+    found = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
     globals()[name] = found
     return found
 
 
 def __dir__() -> list[str]:
     """Return the names of the functions that are imported later, too."""
-    return sorted({*globals(), *_FUNCTIONS})
+    return sorted({*globals(), *_MODULES})
 
 
 def open(

@@ -201,8 +201,7 @@ class EmitterWithoutExtent(mi.Emitter):
         return ds
 
 
-#: Mesh attribute: foam share.
-FOAM = "face_foam"
+FOAM = "face_foam"  #: Mesh attribute: foam share.
 
 
 def fill_mesh(shape: mi.Mesh, mesh: SeaMesh) -> None:

@@ -13,8 +13,8 @@ from mitransient_lidar.core.parameters.bottom import GRAM_CHARLIER_DIELECTRIC, L
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries
 from mitransient_lidar.physics.water.sediments import HapkeSurface, bottom_reflectance
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
-from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.medium.tabulated_phase import deflect
+from mitransient_lidar.transport.medium.water_phases import create_object
 from mitransient_lidar.transport.opaque import opaque
 
 
@@ -74,8 +74,7 @@ class SampledBSDF(mi.BSDF):
         return self.eval_pdf(ctx, si, wo, active)[1]
 
 
-#: Particle parameters.
-_PARTICLES = ("lobe_asymmetry", "backward_share", "opposition_amplitude", "opposition_width")
+_PARTICLES = ("lobe_asymmetry", "backward_share", "opposition_amplitude", "opposition_width")  #: Particle parameters.
 
 
 class Sediment(SampledBSDF):

@@ -14,17 +14,14 @@ from mitransient_lidar.core.parameters.integrators import LIDAR_MERGING, LIDAR_V
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plugins.bases import DeclaredProperties, register
-from mitransient_lidar.transport.daylight.renderer import DaylightRenderer, ReceivedDaylight
-from mitransient_lidar.transport.daylight.scene import DaylightScene
+from mitransient_lidar.transport.daylight.renderer import DaylightRenderer, DaylightScene, ReceivedDaylight
 from mitransient_lidar.transport.merging.layout import MergingOptions
 from mitransient_lidar.transport.merging.renderer import MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses
 from mitransient_lidar.transport.paths.volpath import VolpathOptions, VolpathRenderer
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
-from mitransient_lidar.transport.sensor.receiver import (
-    Receiver,
-)
+from mitransient_lidar.transport.sensor.receiver import Receiver
 
 
 class PassIntegrator(mi.CppADIntegrator):
@@ -34,8 +31,7 @@ class PassIntegrator(mi.CppADIntegrator):
     ``mitransient_lidar.render`` prepares a scene once for all passes.
     """
 
-    #: Integrator name in results.
-    plugin: str
+    plugin: str  #: Integrator name in results.
 
     #: Whether it renders daylight instead of lidar echoes.
     passive = False

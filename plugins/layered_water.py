@@ -23,9 +23,8 @@ from mitransient_lidar.physics.water.water_types import default_water, near_infr
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
 from mitransient_lidar.plugins.phase import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubbles import BubbleLayer, BubblePlume
-from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.medium.water import IndexLayers, Water
-from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases, check_phases
+from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases, check_phases, create_object
 
 logger = logging.getLogger(__name__)
 
@@ -115,9 +114,7 @@ class LayeredWater(mi.Medium):
 
 
 def _read_water(
-    props: DeclaredProperties,
-    nested: dict[str, mi.PhaseFunction],
-    bubbles: mi.PhaseFunction | None,
+    props: DeclaredProperties, nested: dict[str, mi.PhaseFunction], bubbles: mi.PhaseFunction | None
 ) -> Water:
     """Return the water that parameters describe.
 

@@ -17,7 +17,7 @@ from mitransient_lidar.physics.sea.sea_mesh import SIZE_MARGIN, Footprint, Resol
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface, followed_depths
 from mitransient_lidar.physics.sea.shoaling import BottomDepths, ShoalingHeights
 from mitransient_lidar.plugins.bases import FOAM, DeclaredProperties, fill_mesh, register
-from mitransient_lidar.transport.medium.nested_objects import create_object
+from mitransient_lidar.transport.medium.water_phases import create_object
 from mitransient_lidar.transport.plugin_types import WaterMedium
 
 #: Parameter of the loader: whether the mesh is a level plane until `OceanSurface.fit` gets the lidar.

@@ -27,13 +27,7 @@ from mitransient_lidar.physics.water.phase import (
 from mitransient_lidar.physics.water.phase_table import PowerLawTable, read_phase_table
 from mitransient_lidar.physics.water.seawater import water_phase_function
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, register
-from mitransient_lidar.transport.medium.tabulated_phase import (
-    NumberedPhase,
-    TabulatedPhase,
-    deflect,
-    henyey_greenstein,
-    sample_henyey_greenstein,
-)
+from mitransient_lidar.transport.medium import tabulated_phase
 
 
 @closed
@@ -42,12 +36,12 @@ class TabulatedPhaseFunction(mi.PhaseFunction):
 
     def __init__(self, props: mi.Properties, table: PowerLawTable) -> None:
         super().__init__(props)
-        self.tabulated = self.functions = TabulatedPhase(table)
+        self.tabulated = self.functions = tabulated_phase.TabulatedPhase(table)
         self.number = mi.UInt32(0)
         self.backscatter_ratio = table.backscatter_ratio
         self.m_flags = mi.PhaseFunctionFlags.Anisotropic.value
 
-    eval_pdf, sample = NumberedPhase.eval_pdf, NumberedPhase.sample
+    eval_pdf, sample = tabulated_phase.NumberedPhase.eval_pdf, tabulated_phase.NumberedPhase.sample
 
 
 @register("phase", FOURNIER_FORAND)
@@ -82,8 +76,7 @@ class FournierForand(TabulatedPhaseFunction):
 
 logger = logging.getLogger(__name__)
 
-#: Largest relative normalisation error without a warning.
-_TOLERATED = 0.02
+_TOLERATED = 0.02  #: Largest relative normalisation error without a warning.
 
 
 @register("phase", MEASURED_PHASE)
@@ -197,11 +190,13 @@ class TwoTermHenyeyGreenstein(mi.PhaseFunction):
         active: mi.Bool = True,
     ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
         """Sample a direction distributed as the phase function."""
-        forward, backward = (sample_henyey_greenstein(sample2.x, g) for g in (self.g_forward, -self.g_backward))
+        forward, backward = (
+            tabulated_phase.sample_henyey_greenstein(sample2.x, g) for g in (self.g_forward, -self.g_backward)
+        )
         cosine = dr.select(sample1 < self.weight, forward, backward)
-        wo = deflect(mi.Frame3f(-mei.wi), 0.5 * (1 - cosine), dr.two_pi * sample2.y)
+        wo = tabulated_phase.deflect(mi.Frame3f(-mei.wi), 0.5 * (1 - cosine), dr.two_pi * sample2.y)
         return wo, mi.Spectrum(1), self._value(cosine)
 
     def _value(self, cosine: mi.Float) -> mi.Float:
-        forward, backward = (henyey_greenstein(cosine, g) for g in (self.g_forward, -self.g_backward))
+        forward, backward = (tabulated_phase.henyey_greenstein(cosine, g) for g in (self.g_forward, -self.g_backward))
         return self.weight * forward + (1 - self.weight) * backward

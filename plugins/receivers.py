@@ -11,36 +11,25 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.lidar import MULTIPIXEL_RECEIVER, PIXEL_FOV
 from mitransient_lidar.core.validation import finite_array, in_range
 from mitransient_lidar.plugins.bases import DeclaredProperties, closed, read_pose, refuse_medium, register
+from mitransient_lidar.transport.sensor import pixels as arrays
+from mitransient_lidar.transport.sensor import receiver
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.sensor.image_sampling import read_image
-from mitransient_lidar.transport.sensor.pixels import (
-    HexPixels,
-    LayoutPixels,
-    MappedPixels,
-    PixelArray,
-    ShapedPixels,
-    parse_layout,
-)
-from mitransient_lidar.transport.sensor.receiver import (
-    GaussianPointSpread,
-    MeasuredPointSpread,
-    PointSpread,
-    Receiver,
-    ReceiverOptics,
-)
 
 #: Optical parameters of a receiver, in the order of `ReceiverOptics`.
-_OPTICS = tuple(each.name for each in fields(ReceiverOptics))
+_OPTICS = tuple(each.name for each in fields(receiver.ReceiverOptics))
 
 
 @closed
 class ReceiverSensor(mi.Sensor):
     """Sensor of some pixels, with pose, optics and blur from its parameters."""
 
-    def __init__(self, props: DeclaredProperties, pixels: PixelArray) -> None:
+    def __init__(self, props: DeclaredProperties, pixels: arrays.PixelArray) -> None:
         refuse_medium(props)
         super().__init__(props)
-        self.receiver = Receiver(read_pose(props), ReceiverOptics(*map(props.read, _OPTICS)), pixels, _blur(props))
+        self.receiver = receiver.Receiver(
+            read_pose(props), receiver.ReceiverOptics(*map(props.read, _OPTICS)), pixels, _blur(props)
+        )
         self.m_needs_sample_2 = True
         self.m_needs_sample_3 = self.receiver.blur is not None
 
@@ -55,20 +44,20 @@ class ReceiverSensor(mi.Sensor):
         return mi.ScalarBoundingBox3f()
 
 
-def _blur(props: DeclaredProperties) -> PointSpread | None:
+def _blur(props: DeclaredProperties) -> receiver.PointSpread | None:
     """Return a receiver's point-spread function; None for sharp optics."""
     if "blur_file" not in props:
         if "blur_file_mrad" in props:
             raise UserError("blur_file_mrad is the size of blur_file, which is missing")
         width = props.read("blur_mrad")
-        return GaussianPointSpread(1e-3 * width) if width > 0 else None
+        return receiver.GaussianPointSpread(1e-3 * width) if width > 0 else None
     if "blur_file_mrad" not in props:
         raise UserError("blur_file_mrad is missing: the angle [mrad] over which the image blur_file reaches")
     path = str(props["blur_file"])
     values = read_image("blur_file", path)
     if values.min() < 0 or values.max() <= 0:
         raise UserError(f"blur_file = {path!r} must hold values that are not negative and not all 0")
-    return MeasuredPointSpread(values, 1e-3 * props.read("blur_file_mrad"))
+    return receiver.MeasuredPointSpread(values, 1e-3 * props.read("blur_file_mrad"))
 
 
 @register("sensor", PIXEL_FOV)
@@ -93,7 +82,7 @@ class PixelFov(ReceiverSensor):
         # Mitsuba gives a sensor without film, as a nested one, its own and warns of its format.
         mi.set_log_level(mi.LogLevel.Error)
         try:
-            super().__init__(props, ShapedPixels([self.field], [self.pixel_name or "pixel"]))
+            super().__init__(props, arrays.ShapedPixels([self.field], [self.pixel_name or "pixel"]))
         finally:
             mi.set_log_level(level)
 
@@ -157,34 +146,33 @@ class MultipixelReceiver(ReceiverSensor):
         super().__init__(props, _nested_pixels(props, nested) if nested else _own_pixels(props))
 
 
-#: Lens parameters.
-_LENS = ("focal_length_mm", "pixel_pitch_um")
+_LENS = ("focal_length_mm", "pixel_pitch_um")  #: Lens parameters.
 
 
-def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:
+def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> arrays.PixelArray:
     """Build the pixels from nested sensors."""
     if not all(isinstance(pixel, PixelFov) for pixel in nested):
         raise UserError("multipixel_receiver: nested sensors must be pixel_fov")
     names = [pixel.pixel_name or f"pixel{index}" for index, pixel in enumerate(nested)]
-    return ShapedPixels([pixel.field for pixel in nested], names)
+    return arrays.ShapedPixels([pixel.field for pixel in nested], names)
 
 
-def _own_pixels(props: DeclaredProperties) -> PixelArray:
+def _own_pixels(props: DeclaredProperties) -> arrays.PixelArray:
     """Build the pixels from a layout or a map."""
     field_of_view = 1e-3 * props.read("field_of_view_mrad")
     if "pixel_map" in props:
-        return MappedPixels.from_file(str(props["pixel_map"]), field_of_view)
+        return arrays.MappedPixels.from_file(str(props["pixel_map"]), field_of_view)
     layout, fill_factor, imager = str(props.read("layout")), props.read("fill_factor"), props.read("imager")
     if layout.startswith("hex"):
         for name in ("field_of_view_shape", "imager", *_LENS):
             if name in props:
                 raise UserError(f"{name} = {props[name]!r} is for layouts of rows x columns: leave it out")
-        return HexPixels(layout, field_of_view, fill_factor)
+        return arrays.HexPixels(layout, field_of_view, fill_factor)
     if any(name in props for name in _LENS):
         shape = props.read("field_of_view_shape", "square")
-        return LayoutPixels(layout, _sides_of_lens(props, layout), shape, imager, fill_factor)
+        return arrays.LayoutPixels(layout, _sides_of_lens(props, layout), shape, imager, fill_factor)
     shape = props.read("field_of_view_shape", "circle")
-    return LayoutPixels(layout, field_of_view, shape, imager, fill_factor)
+    return arrays.LayoutPixels(layout, field_of_view, shape, imager, fill_factor)
 
 
 def _sides_of_lens(props: DeclaredProperties, layout: str) -> tuple[float, float]:
@@ -193,7 +181,7 @@ def _sides_of_lens(props: DeclaredProperties, layout: str) -> tuple[float, float
         if name not in props:
             raise UserError(f"{name} is missing: a lens needs {' and '.join(_LENS)}")
     focal_length, pitch = map(props.read, _LENS)
-    rows, columns = parse_layout(layout)
+    rows, columns = arrays.parse_layout(layout)
     sides = 1e-3 * pitch / focal_length * rows, 1e-3 * pitch / focal_length * columns
     allowed = MULTIPIXEL_RECEIVER["field_of_view_mrad"]
     if not allowed.low <= 1e3 * min(sides) <= 1e3 * max(sides) <= allowed.high:

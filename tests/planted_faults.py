@@ -273,7 +273,7 @@ FAULTS = (
         near=f"{_UNIT}/analysis/waveforms",
     ),
     Fault(
-        *("slope_away_from_the_lidar", f"{_A}/retrieval/slope_corrections.py"),
+        *("slope_away_from_the_lidar", f"{_A}/retrieval/surface_slope.py"),
         "(a * np.sin(off_nadir)",
         "(-a * np.sin(off_nadir)",
         near=f"{_UNIT}/analysis/retrieval",
@@ -298,7 +298,7 @@ FAULTS = (
         near=f"{_UNIT}/analysis",
     ),
     Fault(
-        *("parabola_turned", f"{_A}/detection/matched_filter.py"),
+        *("parabola_turned", f"{_A}/detection/statistics.py"),
         "0.5 * (left - right)",
         "0.5 * (right - left)",
         near=f"{_UNIT}/analysis/detection",

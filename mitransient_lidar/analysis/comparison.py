@@ -16,8 +16,7 @@ from mitransient_lidar.results.waveform_files import placed_in_time
 
 BoolArray = npt.NDArray[np.bool_]
 
-#: Probability of a difference between two results for the same scene.
-SIGNIFICANCE = 0.01
+SIGNIFICANCE = 0.01  #: Probability of a difference between two results for the same scene.
 
 #: Neighbouring bins over which relative errors are averaged, since value and error of a bin without rare large
 #: contributions are both too small.

@@ -45,9 +45,7 @@ _R = TypeVar("_R")
 _LOG = logging.getLogger(__name__)
 
 DENSEST = 12.0  # largest optical density
-
-#: Largest share of a series' shots that may saturate with an automatic gain or filter.
-SATURATING = 0.05
+SATURATING = 0.05  #: Largest share of a series' shots that may saturate with an automatic gain or filter.
 
 _GAIN = (
     "Factor of the amplifier's gain, or auto for the largest up to 1 without saturation, but of 5 % of a series' "
@@ -74,8 +72,7 @@ def detect_waveforms(
     shots: Annotated[int, Option("Records per waveform, or frames per gate, with independent noise", 1, 10**9)] = 1,
     seed: Seed = 0,
     background_power: Annotated[
-        Powers,
-        Option("Daylight power on each pixel [W] (at least 0)", flag="--background-power-w"),
+        Powers, Option("Daylight power on each pixel [W] (at least 0)", flag="--background-power-w")
     ] = 0.0,
     *,
     gain: Gain = None,
@@ -162,6 +159,9 @@ def detect_waveforms(
     if advice and recorded["saturated"].any():
         _LOG.log(logging.INFO if is_automatic(recorded) else logging.WARNING, "%s", saturation_advice(recorded))
     return recorded
+
+
+record = detect_waveforms  #: Name at the top of the package.
 
 
 def _camera_of(dataset: xr.Dataset, given: Any) -> Camera | None:

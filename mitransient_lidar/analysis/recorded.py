@@ -7,8 +7,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.gates.recording import describe_frames
 
-#: Most pixels whose saturation is listed.
-_LISTED_PIXELS = 12
+_LISTED_PIXELS = 12  #: Most pixels whose saturation is listed.
 
 
 def saturation_advice(recorded: xr.Dataset) -> str:

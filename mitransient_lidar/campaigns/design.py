@@ -46,8 +46,7 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
     "max": np.maximum,
 }
 
-#: Most characters in an expression: its evaluation is recursive.
-_LONGEST = 500
+_LONGEST = 500  #: Most characters in an expression: its evaluation is recursive.
 
 _ALLOWED = f"numbers, parameters, + - * / ** ( ) and {', '.join(_FUNCTIONS)}"
 
@@ -123,17 +122,13 @@ class Expression:
 #: Design kinds: every combination; points of a sequence, of a Latin hypercube, or random ones; file rows.
 DesignKind = Literal["grid", "sobol", "latin_hypercube", "random", "table"]
 
-#: Store contents that a campaign may keep.
-KEPT = ("waveform", "stderr", "components", "echoes", "truth")
-
-#: Most runs in a campaign, and most shots in a run.
-MOST_RUNS, MOST_SHOTS = 10**7, 10_000
+KEPT = ("waveform", "stderr", "components", "echoes", "truth")  #: Store contents that a campaign may keep.
+MOST_RUNS, MOST_SHOTS = 10**7, 10_000  #: Most runs in a campaign, and most shots in a run.
 
 #: Most values in all parameters and runs, and in a table file, a million rows of ten numbers.
 _MOST_VALUES, _MOST_CELLS = 10**8, 2 * 10**7
 
-#: Largest table of runs [bytes].
-_LARGEST_TABLE = 2**27
+_LARGEST_TABLE = 2**27  #: Largest table of runs [bytes].
 
 Column = npt.NDArray[Any]
 

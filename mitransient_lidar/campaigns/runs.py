@@ -1,16 +1,22 @@
-"""Campaign runs: the shots for one parameter set, and the arrays stored from them."""
+"""Campaign runs: shots for one parameter set, arrays stored from them, and versions that decide the numbers."""
 
 from __future__ import annotations
 
+import hashlib
+import importlib.metadata
+import logging
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from mitransient_lidar._version import __version__
 from mitransient_lidar.campaigns.design import Campaign, Column
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import unit_of
@@ -25,17 +31,10 @@ from mitransient_lidar.rendering.passes import SMALLEST_SHARE
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.attributes import described
 
-#: Half the side of the square that contains a sea's locations [m].
-_REACH = 256.0
-
-#: Relative margin of a shared record on both sides.
-_MARGIN = 0.05
-
-#: Number of the random sea; each run has its own unless the campaign gives it.
-_SEA = "surface_seed"
-
-#: Whole numbers for random seas.
-_SEAS = 2**31 - 1
+_REACH = 256.0  #: Half the side of the square that contains a sea's locations [m].
+_MARGIN = 0.05  #: Relative margin of a shared record on both sides.
+_SEA = "surface_seed"  #: Number of the random sea; each run has its own unless the campaign gives it.
+_SEAS = 2**31 - 1  #: Whole numbers for random seas.
 
 
 class Array(NamedTuple):
@@ -117,10 +116,7 @@ class RunRenderer(Renderer):
     def series(self, number: int, values: Mapping[str, Any], **options: Any) -> xr.Dataset:
         """Return a run's shots, as from `render_shots`, from its row number and parameters.
 
-        Raises
-        ------
-        UserError
-            If the scene refuses the parameters, or the light does not fit the record.
+        Raises `UserError` if the scene refuses the parameters, or the light does not fit the record.
         """
         campaign, known = self.plan, self.scene.values
         params = {**campaign.fixed, **self.inputs(number, values)}
@@ -370,3 +366,75 @@ def plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
         str(name): value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
         for name, value in attributes.items()
     }
+
+
+_LOG = logging.getLogger(__name__)
+
+#: Packages whose version decides the numbers. LLVM does not: 22.1 and 23.1 give the same bits.
+_PACKAGES = ("mitsuba", "drjit", "numpy")
+
+_SUFFIXES = (".py", ".csv", ".toml")  #: Files of the package that decide the numbers, by suffix.
+FILES = "files of mitransient-lidar"  #: Name of the SHA-256 of the files.
+
+
+def own_versions() -> dict[str, str]:
+    """Return this process's versions by name, and the first digits of the SHA-256 of the package's files.
+
+    An installation from sources keeps its version while its files change.
+    """
+    return {
+        "mitransient-lidar": __version__,
+        FILES: _digest(),
+        **{name: importlib.metadata.version(name) for name in _PACKAGES},
+        "python": ".".join(map(str, sys.version_info[:2])),
+    }
+
+
+def difference(wanted: Mapping[str, str], found: Mapping[str, str]) -> str | None:
+    """Return in words which version is found where another one is wanted, None where all are the same."""
+    texts: list[str] = []
+    for name, version in wanted.items():
+        other = found.get(name, "unknown")
+        # Another version has other files.
+        if other != version and not (name == FILES and texts):
+            texts.append(f"{name} {other} instead of {version}")
+    return " and ".join(texts) or None
+
+
+def check_versions(store: Path, attributes: Mapping[str, Any]) -> None:
+    """Raise `UserError` if current renders would give other numbers than the versions that a store has.
+
+    Package files that have changed since, as in a source folder, give a warning.
+    """
+    own = own_versions()
+    # Stores from version 0.2 state Mitsuba and Dr.Jit alone.
+    first = {name: attributes.get(f"{name}_version", own[name]) for name in ("mitsuba", "drjit")}
+    begun = attributes.get("versions", first)
+    if differs := difference({**begun, FILES: own[FILES]}, own):
+        raise UserError(
+            f"{store} was begun by other versions, and here is {differs}: install those, or choose another place"
+        )
+    if difference(begun, own):
+        _LOG.warning("files of this package have changed since %s was begun: numbers may differ", store)
+
+
+def other_versions(place: str, differs: str) -> str:
+    """Return the sentence that refuses a place, as a worker, with other versions."""
+    return f"{place} has {differs}: all that render into a store must have the same"
+
+
+def _digest() -> str:
+    """Return the first digits of the SHA-256 of the files, the same for a wheel and for sources.
+
+    Scenes are left out: a store holds its own.
+    """
+    import mitransient_lidar.plugins
+
+    found = hashlib.sha256()
+    for module, others in ((mitransient_lidar, ("plugins", "scenes")), (mitransient_lidar.plugins, ())):
+        root = Path(module.__file__ or "").parent
+        for path in sorted(root.rglob("*")):
+            name = path.relative_to(root)
+            if path.suffix in _SUFFIXES and name.parts[0] not in others:
+                found.update(f"{name.as_posix()}\0".encode() + path.read_bytes() + b"\0")
+    return found.hexdigest()[:12]

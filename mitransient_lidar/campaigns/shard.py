@@ -31,31 +31,25 @@ import numpy as np
 import numpy.typing as npt
 import psutil
 
-from mitransient_lidar.campaigns.runs import Array, Renderer
+from mitransient_lidar.campaigns.runs import Array, Renderer, difference, other_versions, own_versions
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store
-from mitransient_lidar.campaigns.versions import difference, other_versions, own_versions
 from mitransient_lidar.core.errors import LINES, UserError, printable, raise_if_out_of_memory
 from mitransient_lidar.core.files import open_log
 
 _LOG = logging.getLogger(__name__)
 
-#: Time between two writes of a shard that is not finished [s].
-_INTERVAL_S = 60.0
+_INTERVAL_S = 60.0  #: Time between two writes of a shard that is not finished [s].
 
 #: Number of times that the process may end while it renders a run before this run has failed, or before its first run.
 _MOST_DEATHS, _MOST_STARTS = 2, 3
 
-#: Number of runs with a program error, or that hang, after which the rest of a shard is left.
-_MOST_BUGS = 3
-
-#: Longest program error reason; the log contains the traceback.
-_LONGEST_REASON = 200
+_MOST_BUGS = 3  #: Number of runs with a program error, or that hang, after which the rest of a shard is left.
+_LONGEST_REASON = 200  #: Longest program error reason; the log contains the traceback.
 
 #: Environment variables with thread numbers for numerical libraries.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
-#: Time for a process to write the runs that it has when the campaign ends [s].
-_WRITE_S = 10.0
+_WRITE_S = 10.0  #: Time for a process to write the runs that it has when the campaign ends [s].
 
 #: Time between two checks of a process [s], and number of checks without any processor time after which it hangs;
 #: checks while it waits for a disk, which may be a server's, do not count.
@@ -86,7 +80,7 @@ class _End(NamedTuple):
 class Processes:
     """Processes of a campaign's shards, which `end` ends together.
 
-    `versions`: required versions, as from `versions.own_versions`; by default any. `place`: their machine, for
+    `versions`: required versions, as from `runs.own_versions`; by default any. `place`: their machine, for
     messages.
     """
 
@@ -138,18 +132,8 @@ def render_in_process(
 
     Raises UserError if the store cannot be read or written, or the process has other versions than it must have.
 
-    Parameters
-    ----------
-    path
-        Store folder.
-    shard
-        Shard number.
-    retry
-        Whether to render runs that have failed, too.
-    report
-        Called with the numbers of runs done and failed after each run.
-    processes
-        Processes that the new one belongs to.
+    `path`: store folder. `shard`: shard number. `retry`: whether to render runs that have failed, too. `report`: called
+    with the numbers of runs done and failed after each run. `processes`: processes that the new one belongs to.
     """
     processes = processes or Processes()
     reasons: dict[int, str] = {}

@@ -25,8 +25,7 @@ import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from mitransient_lidar.campaigns.design import MOST_RUNS, Column
-from mitransient_lidar.campaigns.runs import Array, Renderer
-from mitransient_lidar.campaigns.versions import own_versions
+from mitransient_lidar.campaigns.runs import Array, Renderer, own_versions
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.files import check_encodable, check_tree, sweep, temporary_beside
 from mitransient_lidar.core.validation import integer, require_memory, shown
@@ -38,20 +37,14 @@ from mitransient_lidar.results.attributes import described
 
 _LOG = logging.getLogger(__name__)
 
-#: Values of the variable ``status``.
-PLANNED, DONE, FAILED = 0, 1, 2
+PLANNED, DONE, FAILED = 0, 1, 2  #: Values of the variable ``status``.
 
 #: Fewest and most runs per shard, and number of shards in a campaign if its runs allow.
 _FEWEST, _MOST, _SHARDS = 8, 1024, 16
 
-#: Largest size of a shard in memory [bytes], by default.
-LARGEST_BYTES = 2**29
-
-#: Memory per byte of a shard: itself, and its chunk while that is written.
-BYTES_PER_BYTE = 2
-
-#: Most runs in a requested shard, and in a chunk of an array for all runs.
-LARGEST_SHARD = 10**6
+LARGEST_BYTES = 2**29  #: Largest size of a shard in memory [bytes], by default.
+BYTES_PER_BYTE = 2  #: Memory per byte of a shard: itself, and its chunk while that is written.
+LARGEST_SHARD = 10**6  #: Most runs in a requested shard, and in a chunk of an array for all runs.
 
 _INPUT = "_input"  # suffix of scene parameters with the name of a variable
 
@@ -296,10 +289,7 @@ class Store:
     ) -> None:
         """Write a shard, its status last; one that another process has finished is left as it is.
 
-        Raises
-        ------
-        WriteError
-            If the operating system reports an error.
+        Raises `WriteError` if the operating system reports an error.
         """
         runs = self.runs_of(shard)
         if np.all(self.status(runs) == DONE):
@@ -374,10 +364,7 @@ def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
     runs are NaN, or 0 for integers. Runs that have lost an array in the store are planned; a damaged array raises
     ``ValueError`` when it is read.
 
-    Raises
-    ------
-    UserError
-        If there is no campaign store, or its coordinates are damaged.
+    Raises `UserError` if there is no campaign store, or its coordinates are damaged.
     """
     store = Store(path)
     with _reading(path, "a coordinate"):

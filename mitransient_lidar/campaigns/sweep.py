@@ -18,10 +18,9 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.campaigns.design import Campaign
-from mitransient_lidar.campaigns.runs import RunRenderer, check_names, source_of
+from mitransient_lidar.campaigns.runs import RunRenderer, check_names, check_versions, source_of
 from mitransient_lidar.campaigns.shard import Outcome, log_path
 from mitransient_lidar.campaigns.store import BYTES_PER_BYTE, DONE, FAILED, LARGEST_SHARD, PLANNED, Store, open_campaign
-from mitransient_lidar.campaigns.versions import check_versions
 from mitransient_lidar.campaigns.workers import REPORT_S, Workers, connected, on_cluster, on_this_machine
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path
@@ -35,14 +34,9 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-#: Shards for each worker that are with the scheduler at a time.
-_AHEAD = 4
-
-#: Shards with runs that could not be rendered after which the campaign ends.
-_MOST_LEFT = 8
-
-#: Runs that are tried until one shows a store's arrays.
-_TRIALS = 8
+_AHEAD = 4  #: Shards for each worker that are with the scheduler at a time.
+_MOST_LEFT = 8  #: Shards with runs that could not be rendered after which the campaign ends.
+_TRIALS = 8  #: Runs that are tried until one shows a store's arrays.
 
 
 #: Options for campaigns and flights.

@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Protocol
 
+from mitransient_lidar.campaigns.runs import difference, other_versions, own_versions
 from mitransient_lidar.campaigns.shard import Outcome, Processes, render_in_process
-from mitransient_lidar.campaigns.versions import difference, other_versions, own_versions
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -27,16 +27,14 @@ _LOG = logging.getLogger(__name__)
 #: Time between two reports of a shard, and time to wait for a scheduler to connect [s].
 REPORT_S, _CONNECT_S = 1.0, 15.0
 
-#: Time after which a scheduler that does not answer is lost [s].
-_ANSWER_S = 300.0
+_ANSWER_S = 300.0  #: Time after which a scheduler that does not answer is lost [s].
 
 _LOST = "the scheduler was lost: what is written is kept, and the same command goes on"
 
 #: Function that takes a shard and its numbers of runs done and failed.
 Tell = Callable[[int, int, int], None]
 
-#: Campaign processes on this cluster worker.
-_PROCESSES: dict[str, Processes] = {}
+_PROCESSES: dict[str, Processes] = {}  #: Campaign processes on this cluster worker.
 
 
 class Workers(Protocol):

@@ -144,8 +144,7 @@ def _echoes(
         ),
     ] = None,
     wind_speed: Annotated[
-        float | None,
-        Option("Wind speed for the corrections [m/s] (at least 0), by default the scene's"),
+        float | None, Option("Wind speed for the corrections [m/s] (at least 0), by default the scene's")
     ] = None,
     waveforms: Waveforms = None,
     channel: Channel = None,

@@ -89,10 +89,7 @@ def _show(store: Path, path: Path) -> None:
 @COMMANDS.add("Render", "flights.fly:fly", "palmer")
 def _fly(
     call: Call,
-    output: Annotated[
-        Path | None,
-        Option("Folder for the files, by default output/FLIGHT", form="DIR"),
-    ] = None,
+    output: Annotated[Path | None, Option("Folder for the files, by default output/FLIGHT", form="DIR")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Render the pulses of a flight, and write the points and waveforms that its receiver finds.

@@ -102,11 +102,8 @@ def write_page(page: View, path: Path | None) -> Path:
         return page.save(path)
 
 
-#: Gate stacks that are drawn, and written to EXR files, in single precision [bytes].
-_LARGE = 2**28
-
-#: Largest size of a page [MB].
-PAGE_MB = 200.0
+_LARGE = 2**28  #: Gate stacks that are drawn, and written to EXR files, in single precision [bytes].
+PAGE_MB = 200.0  #: Largest size of a page [MB].
 
 
 @dataclass(frozen=True)

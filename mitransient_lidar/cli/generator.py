@@ -25,8 +25,7 @@ Define = Annotated[
     list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter. Repeatable.")
 ]
 DrawingOnly = Annotated[Path | None, Option("PNG, PDF or SVG file to write")]
-#: Default folder for rendered files.
-OUTPUT = Path("output")
+OUTPUT = Path("output")  #: Default folder for rendered files.
 #: Options of commands that read full-waveform files of lidars (`waveform_selection`).
 Waveforms = Annotated[
     str | None,
@@ -151,8 +150,7 @@ _REPEATED: dict[str, Callable[[str, str], Any]] = {
     "NAME[=STD]": name_and_deviation,
 }
 
-#: Types that are read as they are.
-_PLAIN = (float, int, bool, Path, str)
+_PLAIN = (float, int, bool, Path, str)  #: Types that are read as they are.
 
 
 def function_at(place: str) -> Callable[..., Any]:

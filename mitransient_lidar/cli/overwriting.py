@@ -32,8 +32,7 @@ Overwrite = Annotated[
     ),
 ]
 
-#: A file that took longer to make is kept [s].
-_LONG_S = 60.0
+_LONG_S = 60.0  #: A file that took longer to make is kept [s].
 
 #: Arguments that are results, whose scene and instrument count, and other arguments that name a command's subject.
 _RESULTS = ("file", "stack", "first", "second")

@@ -8,15 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import (
-    GateFiles,
-    announced,
-    check_figure,
-    check_suffix,
-    check_targets,
-    scene_of,
-    write_netcdf,
-)
+from mitransient_lidar.cli import files
 from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, Quiet, function_at
 from mitransient_lidar.cli.messages import exit_if_interrupted, summarise
 from mitransient_lidar.core.errors import UserError, WriteError
@@ -50,20 +42,20 @@ def _render(
     passes, from the second one on.
     """
     scene = call.arguments["scene"]
-    name, text, _ = scene_of(scene, "render")
+    name, text, _ = files.scene_of(scene, "render")
     # Checked before the render: films with gates have the parameter gate_count.
     if (gif or mp4 or html) and "gate_count" not in text:
         raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates")
     targets = [output / f"{name}{ending}" for ending in (".exr", ".nc", *((".png", "_layout.png") if plot else ()))]
     targets += [output / f"{name}_components.png"] if plot and call.arguments["components"] else []
     targets += [output / f"{name}_derivatives.png"] if plot and call.arguments["derivatives"] else []
-    gates = GateFiles.of(output, name, drawings=plot, gif=gif, mp4=mp4, html=html)
-    check_targets(output, [*targets, *gates.names()], scene)
+    gates = files.GateFiles.of(output, name, drawings=plot, gif=gif, mp4=mp4, html=html)
+    files.check_targets(output, [*targets, *gates.names()], scene)
     with DeferredInterrupt(at_once=False):
         dataset = call()
         if "waveform" not in dataset:
             targets = [output / f"{name}.nc"]
-        with announced(output):
+        with files.announced(output):
             for target in targets:
                 _write(dataset, target)
             if "gate_energy" in dataset:
@@ -114,13 +106,11 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
 def _shots(
     call: Call,
     places: Annotated[
-        Path | None,
-        Option("CSV file with shot locations, columns x and y [m], instead of random ones", form="FILE"),
+        Path | None, Option("CSV file with shot locations, columns x and y [m], instead of random ones", form="FILE")
     ] = None,
     output: Annotated[Path, Option("NetCDF file for all shots")] = OUTPUT / "shots.nc",
     figure: Annotated[
-        Path | None,
-        Option("PNG, PDF or SVG file of the echoes against the slopes; also writes these data as .nc"),
+        Path | None, Option("PNG, PDF or SVG file of the echoes against the slopes; also writes these data as .nc")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -133,12 +123,12 @@ def _shots(
     ways = {"--at": given["positions"], "--places": places, "--count": given["count"]}
     if len(used := [name for name, value in ways.items() if value]) > 1:
         raise UserError(f"{' and '.join(used[:2])} are alternatives: give one of them")
-    check_suffix("--output", output, ".nc")
-    check_figure(figure, ".nc", option="--figure")
+    files.check_suffix("--output", output, ".nc")
+    files.check_figure(figure, ".nc", option="--figure")
     if figure is not None and figure.with_suffix(".nc") == output:
         raise UserError(f"--figure {figure} has its data in {output}, which holds the shots: give it another name")
-    scene_of(scene, "shots")
-    check_targets(output.parent, [output], scene)
+    files.scene_of(scene, "shots")
+    files.check_targets(output.parent, [output], scene)
     from mitransient_lidar import results
     from mitransient_lidar.plots.studies.shots import plot_shot_statistics
     from mitransient_lidar.rendering.again import is_result
@@ -157,12 +147,12 @@ def _shots(
         given = {"count": 20, **{name: value for name, value in given.items() if value is not None}}
     with DeferredInterrupt(at_once=False):
         series = _again(replace(call, arguments=given))()
-        with announced(output.parent, figure and figure.parent):
+        with files.announced(output.parent, figure and figure.parent):
             results.save(series, output)
             if figure is not None:
                 measured = statistics.shot_statistics(series)
                 plot_shot_statistics(measured, figure)
-                write_netcdf(measured, figure.with_suffix(".nc"))
+                files.write_netcdf(measured, figure.with_suffix(".nc"))
     if not quiet:
         typer.echo("\n".join(study.describe_shots(series)))
     if figure is not None:
@@ -190,12 +180,12 @@ def _frames(
     Ctrl-C keeps the completed frames.
     """
     scene = call.arguments["scene"]
-    name, _, _ = scene_of(scene, "frames")
-    target, gates = output / f"{name}_frames.nc", GateFiles.of(output, f"{name}_frames", drawings=plot)
-    check_targets(output, [target, *gates.names()], scene)
+    name, _, _ = files.scene_of(scene, "frames")
+    target, gates = output / f"{name}_frames.nc", files.GateFiles.of(output, f"{name}_frames", drawings=plot)
+    files.check_targets(output, [target, *gates.names()], scene)
     with DeferredInterrupt(at_once=False):
         frames = _again(call)()
-        with announced(output):
+        with files.announced(output):
             _write(frames, target)
             gates.write(frames, None, quiet)
     exit_if_interrupted(frames)
@@ -219,18 +209,18 @@ def _passive(
     and passes hold for each frame.
     """
     scene, frames = call.arguments["scene"], call.arguments["frames"]
-    name, _, former = scene_of(scene, "passive")
+    name, _, former = files.scene_of(scene, "passive")
     is_animation = (frames or len(former.get("frame_passes", [0]))) > 1
     suffixes = [".nc", ".exr", *([".png"] if plot else []), *([".gif"] if plot and is_animation else [])]
     targets = [output / f"{name}_passive{suffix}" for suffix in suffixes]
-    check_targets(output, targets, scene)
+    files.check_targets(output, targets, scene)
     from mitransient_lidar.plots.gates.images import animate_passive, plot_passive
     from mitransient_lidar.results import save
 
     with DeferredInterrupt(at_once=False):
         image = _again(call)()
         writers: dict[str, Any] = {".gif": animate_passive, ".png": plot_passive}
-        with announced(output):
+        with files.announced(output):
             for target in targets:
                 if target.suffix != ".gif" or "row" in image.dims:
                     writers.get(target.suffix, save)(image, target)

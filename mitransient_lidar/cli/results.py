@@ -8,17 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mitransient_lidar.cli import generator
 from mitransient_lidar.cli.files import PAGE_MB, announced, check_figure, check_suffix, write_page
-from mitransient_lidar.cli.generator import (
-    Channel,
-    Commands,
-    Define,
-    DrawingOnly,
-    Lidar,
-    Quiet,
-    Waveforms,
-    waveform_selection,
-)
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.cli.overwriting import draws_again, parameters
 from mitransient_lidar.core.errors import UserError
@@ -27,7 +18,7 @@ from mitransient_lidar.core.options import Option
 if TYPE_CHECKING:
     import xarray as xr
 
-COMMANDS = Commands()
+COMMANDS = generator.Commands()
 
 _DIFFERENT = 1
 
@@ -44,8 +35,7 @@ def _view(
         ),
     ],
     output: Annotated[
-        Path | None,
-        Option("HTML file for the page, by default a temporary one; PNG, PDF or SVG file for a drawing"),
+        Path | None, Option("HTML file for the page, by default a temporary one; PNG, PDF or SVG file for a drawing")
     ] = None,
     browser: Annotated[bool, Option("Open the page in the browser")] = True,
     shot: Annotated[int | None, Option("Number of a shot in a series, from 0; by default their mean")] = None,
@@ -54,11 +44,11 @@ def _view(
     linear: Annotated[bool, Option("Draw them with a linear power axis only")] = False,
     components: Annotated[bool, Option("Draw the light by origin instead, to FILE_components.png")] = False,
     layout: Annotated[bool, Option("Draw pixels, beam and targets on the sea instead, to FILE_layout.png")] = False,
-    waveforms: Waveforms = None,
-    channel: Channel = None,
-    lidar: Lidar = None,
-    define: Define = None,
-    quiet: Quiet = False,
+    waveforms: generator.Waveforms = None,
+    channel: generator.Channel = None,
+    lidar: generator.Lidar = None,
+    define: generator.Define = None,
+    quiet: generator.Quiet = False,
 ) -> None:
     """Show a result, a scene or the points of a flight in the browser, or draw a result's waveforms or layout.
 
@@ -71,7 +61,7 @@ def _view(
     depths and the bottom: x, y, z.
     """
     is_page = output is None or output.suffix.lower() == ".html"
-    selection = waveform_selection(file, waveforms, channel, lidar)
+    selection = generator.waveform_selection(file, waveforms, channel, lidar)
     others = {"--plot": plot, "--log": log, "--linear": linear, "--components": components, "--layout": layout}
     # A LAS file is one of points unless its waveforms are asked for.
     if is_points := _is_points(file) and not (waveforms or channel or lidar):
@@ -173,10 +163,10 @@ def _compare(
         Path, Option("An EXR or NetCDF result, or the record of shots, also LAS or .pls", form="FILE", is_argument=True)
     ],
     second: Annotated[Path, Option("A result with the same pixels and bins or gates", form="OTHER", is_argument=True)],
-    output: DrawingOnly = None,
-    waveforms: Waveforms = None,
-    channel: Channel = None,
-    lidar: Lidar = None,
+    output: generator.DrawingOnly = None,
+    waveforms: generator.Waveforms = None,
+    channel: generator.Channel = None,
+    lidar: generator.Lidar = None,
 ) -> None:
     """Test whether two results agree within their errors.
 
@@ -190,7 +180,7 @@ def _compare(
     target = output or second.with_name(f"{first.stem}_{second.stem}.png")
     check_figure(target)
     recorded = [one for one in (first, second) if is_waveform_file(one)]
-    selection = waveform_selection(recorded[0] if recorded else first, waveforms, channel, lidar)
+    selection = generator.waveform_selection(recorded[0] if recorded else first, waveforms, channel, lidar)
     given = (
         results.dataset_of(name, one, "result", "gates", "signals", **(selection if one in recorded else {}))
         for name, one in (("FILE", first), ("OTHER", second))

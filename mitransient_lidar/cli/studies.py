@@ -17,8 +17,7 @@ COMMANDS = Commands()
 
 Figure = Annotated[Path, Option("PNG, PDF or SVG file; also writes the data as .nc")]
 
-#: Headings of the help.
-_DESIGN, _SURVEY = "Targets, designs and scattering", "Depths and their uncertainty"
+_DESIGN, _SURVEY = "Targets, designs and scattering", "Depths and their uncertainty"  #: Headings of the help.
 
 
 def _study(
@@ -156,9 +155,7 @@ def _depth_bias(
 
 @COMMANDS.add(_SURVEY, "studies.depth_bias:tpu", "riegl_vq840g --altitudes 100,150")
 def _tpu(
-    call: Call,
-    output: Annotated[Path, Option("Folder for the files", form="DIR")] = OUTPUT,
-    quiet: Quiet = False,
+    call: Call, output: Annotated[Path, Option("Folder for the files", form="DIR")] = OUTPUT, quiet: Quiet = False
 ) -> None:
     """Determine the vertical and horizontal uncertainty of an instrument's soundings.
 

@@ -6,8 +6,7 @@ import re
 #: separators; and lone surrogates, which represent file name bytes that are no text.
 _CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
-#: Controls that a text with several lines keeps.
-LINES = "\n\t"
+LINES = "\n\t"  #: Controls that a text with several lines keeps.
 
 #: Longest message, and the parts at its ends that are kept of a longer one, in characters.
 _LONGEST, _BEGINNING, _END = 2000, 1500, 400

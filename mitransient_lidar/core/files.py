@@ -36,8 +36,7 @@ _FORGOTTEN_S = 7 * 24 * 3600.0
 #: Paths that are not read, besides folders: their end may never come.
 _OTHERS = {stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFSOCK: "a socket"}
 
-#: Longest name of a file [bytes], which leaves room for endings.
-_LONGEST_NAME = 200
+_LONGEST_NAME = 200  #: Longest name of a file [bytes], which leaves room for endings.
 
 #: Temporary files and their destinations, within the context `together`.
 _moves: ContextVar[list[tuple[Path, Path]] | None] = ContextVar("moves", default=None)

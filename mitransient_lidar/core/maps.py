@@ -199,18 +199,15 @@ def distortions(system: Any, longitude: FloatArray, latitude: FloatArray) -> tup
 #: Value of ASCII grid cells without a height, if the header does not name another, and of empty BAG cells.
 _ASCII_EMPTY, _BAG_EMPTY = -9999.0, 1e6
 
-#: Relative difference between a cell and the no-height value: it may be written with six digits.
-_ROUNDED = 1e-5
+_ROUNDED = 1e-5  #: Relative difference between a cell and the no-height value: it may be written with six digits.
 
-#: Largest distance of heights from the mean sea level [m]: deeper than any sea.
-_HIGHEST = 12_000.0
+_HIGHEST = 12_000.0  #: Largest distance of heights from the mean sea level [m]: deeper than any sea.
 
 #: Numbers that programs write for no data, of either sign, where no other height is nearer than a tenth of them.
 NO_DATA = (99.0, 999.0, 9999.0)
 _NEAR = 0.1
 
-#: Largest deviation between a BAG file's corners and its cells, in cells.
-_CORNER_TOLERANCE = 0.1
+_CORNER_TOLERANCE = 0.1  #: Largest deviation between a BAG file's corners and its cells, in cells.
 
 
 class Stated(NamedTuple):

@@ -37,8 +37,7 @@ _FORMATS: dict[str, Callable[[bytes], bytes]] = {
     **dict.fromkeys((".nc", ".exr"), lambda text: text),
 }
 
-#: Bytes after the mark, by file suffix.
-_ENDS = {".png": b"\0\0\0\0IEND", ".gif": b";", ".pdf": b"startxref"}
+_ENDS = {".png": b"\0\0\0\0IEND", ".gif": b";", ".pdf": b"startxref"}  #: Bytes after the mark, by file suffix.
 
 
 def holds_mark(path: Path) -> bool:

@@ -32,20 +32,12 @@ from typing import (
 
 import numpy as np
 
+from mitransient_lidar.core import validation
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.documents import check_keys, required, table
-from mitransient_lidar.core.validation import (
-    FloatArray,
-    finite_array,
-    integer,
-    number_list,
-    number_within,
-    relative_error,
-    shown,
-)
+from mitransient_lidar.core.validation import shown
 
-#: Shortest time between two states that are shown [s].
-_INTERVAL_S = 0.2
+_INTERVAL_S = 0.2  #: Shortest time between two states that are shown [s].
 
 #: Whether a public function runs: of one that calls others, the notebook shows the whole alone.
 _running: ContextVar[bool] = ContextVar("running", default=False)
@@ -90,7 +82,7 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 #: Numbers in a list or an array, shape (N,).
-Numbers = Sequence[float] | FloatArray
+Numbers = Sequence[float] | validation.FloatArray
 
 
 @dataclass(frozen=True)
@@ -142,13 +134,13 @@ class Option:
         """Return a number, or a whole one; raise `UserError` if it is out of range."""
         low, high = -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
         if whole:
-            return integer(name, value, int(low), int(high))
+            return validation.integer(name, value, int(low), int(high))
         if self.above and high == 1 and name.endswith("error"):
-            return relative_error(name, value)
-        return number_within(name, value, low, high, above=self.above)
+            return validation.relative_error(name, value)
+        return validation.number_within(name, value, low, high, above=self.above)
 
     def _check_list(self, name: str, values: Any) -> list[float]:
-        numbers, low = number_list(name, values), self.low or 0
+        numbers, low = validation.number_list(name, values), self.low or 0
         inside = (numbers > low if self.above else numbers >= low) & (numbers <= (self.high or np.inf))
         if not inside.all() or (self.ascending and np.any(np.diff(numbers) <= 0)):
             raise UserError(f"{name} = {numbers.tolist()} must be numbers ({self.range()})")
@@ -427,7 +419,7 @@ def _list(name: str, value: Any, kinds: tuple[Any, ...], option: Option) -> tupl
         if not isinstance(names, (list, tuple)) or not all(isinstance(one, str) for one in names):
             raise UserError(f"{name} = {shown(value)} must be a list of names")
         return tuple(names)
-    ends = finite_array(name, value)
+    ends = validation.finite_array(name, value)
     if ends.ndim != 1 or (Ellipsis not in kinds and ends.size != len(kinds)):
         raise UserError(f"{name} = {shown(value)} must be {option.form or 'a list of numbers'}")
     return tuple(option.number(name, end) for end in ends.tolist())

@@ -61,19 +61,12 @@ EXTRA_BYTES = (
 def coordinate_system_wkt(crs: str | None, place: tuple[float, float] | None = None) -> str:
     """Return a coordinate system as WKT by OGC's specification (2001), which LAS 1.4 needs.
 
-    Parameters
-    ----------
-    crs : str or None
-        What pyproj understands: a code such as 'EPSG:32633' or 'EPSG:32633+5773' (with heights), a WKT. None: the scene
-        frame, an engineering system in metres with x east, y north, z up.
-    place : (float, float), optional
-        Point x, y [m] at which its metres must be those on the ground.
+    `crs`: what pyproj understands: a code such as 'EPSG:32633' or 'EPSG:32633+5773' (with heights), a WKT. None: the
+    scene frame, an engineering system in metres with x east, y north, z up. `place`: point x, y [m] at which its metres
+    must be those on the ground.
 
-    Raises
-    ------
-    UserError
-        If the system is unknown, has no such WKT, is not a projected one in metres to east and north, or has another
-        scale than the ground.
+    Raises `UserError` if the system is unknown, has no such WKT, is not a projected one in metres to east and north, or
+    has another scale than the ground.
     """
     if crs is None:
         return SCENE_WKT
@@ -108,20 +101,10 @@ def las_header(
 ) -> laspy.LasHeader:
     """Return a LAS 1.4 header.
 
-    Parameters
-    ----------
-    point_format : int
-        6, or 9 with waveforms in an external file.
-    first : tuple of float
-        First point's coordinates x, y [m]; offsets are whole kilometres near it, and 0 for z.
-    wkt : str
-        Coordinate system.
-    notes : str
-        Text for the reader, as Text Area Description.
-    descriptor : bytes
-        Waveform Packet Descriptor for format 9.
-    time_system : str
-        Pulse time system, from `TIME_NOTES`.
+    `point_format`: 6, or 9 with waveforms in an external file. `first`: first point's coordinates x, y [m]; offsets are
+    whole kilometres near it, and 0 for z. `wkt`: coordinate system. `notes`: text for the reader, as Text Area
+    Description. `descriptor`: Waveform Packet Descriptor for format 9. `time_system`: pulse time system, from
+    `TIME_NOTES`.
     """
     import laspy
     from laspy.header import GpsTimeType

@@ -33,15 +33,13 @@ from mitransient_lidar.results.attributes import PointClass
 #: Parameters of the scene that the poses of the pulses replace.
 POSE_PARAMETERS = ("aim_x", "aim_y", "altitude", "off_nadir_deg")
 
-#: Most pulses of a flight.
-MOST_PULSES = 1_000_000
+MOST_PULSES = 1_000_000  #: Most pulses of a flight.
 
 #: Classes of echoes between surface and bottom: objects, vegetation of the draft of the second bathymetric profile of
 #: LAS (46), and vegetation as NOAA marked it before (64).
 OBJECT_CLASSES = (int(PointClass.OBJECT), 46, 64)
 
-#: Largest difference of coordinates of one place [m], that of the rounding in files.
-SAME_PLACE_M = 1e-3
+SAME_PLACE_M = 1e-3  #: Largest difference of coordinates of one place [m], that of the rounding in files.
 
 
 @dataclass(frozen=True)
@@ -200,11 +198,8 @@ class FlightPlan(Plan):
     def poses(self) -> PulsePoses:
         """Return the lines of sight of all rendered pulses, in the scene frame.
 
-        Raises
-        ------
-        UserError
-            For a platform, a scanner or a mounting that is invalid, a platform in other coordinates than the points,
-            and too many pulses.
+        Raises `UserError` for a platform, a scanner or a mounting that is invalid, a platform in other coordinates than
+        the points, and too many pulses.
         """
         platform = self._platform
         trajectory = platform.trajectory(self.folder)

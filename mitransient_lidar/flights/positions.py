@@ -51,50 +51,27 @@ def positions(
 ) -> xr.Dataset:
     """Compute the points of echoes.
 
-    Parameters
-    ----------
-    echoes
-        Echoes from `echo_table.extract` with one estimator and depths from the surface echo, corrected by
-        `depth_correction.correct_depths` or not. Over ``shot`` and ``pixel``, or ``row`` and ``column``.
-    poses
-        Pulse poses, with arrays of shape (shots, 3).
-    angle_x, angle_y
-        Tangent-plane angles of the pixels' lines of sight [rad], +angle_y to the left; they broadcast to (shots,
-        pixels). Those of results are ``sight_x`` and ``sight_y``.
-    refractive_index, group_index
-        Indices of the water, 1 to 2 and 1 to 3.
-    surface
-        The sea; by default, level at z = 0, with the slopes in the echoes' attributes.
-    errors
-        Pose standard deviations; by default `PoseErrors`.
-    forward
-        Platform's forward axis, not vertical, shape (3,) or (shots, 3). Needed where roll and pitch have different
-        errors.
-    view_x, view_y
-        Standard deviations of a pixel's light about its line of sight [rad], at least 0; they broadcast to (shots,
-        pixels).
-    time_s
-        Times of the pulses [s], shape (shots,). A surface with planes needs them.
+    `echoes`: echoes from `echo_table.extract` with one estimator and depths from the surface echo, corrected by
+    `depth_correction.correct_depths` or not. Over ``shot`` and ``pixel``, or ``row`` and ``column``. `poses`: pulse
+    poses, with arrays of shape (shots, 3). `angle_x`, `angle_y`: tangent-plane angles of the pixels' lines of sight
+    [rad], +angle_y to the left; they broadcast to (shots, pixels). Those of results are ``sight_x`` and ``sight_y``.
+    `refractive_index`, `group_index`: indices of the water, 1 to 2 and 1 to 3. `surface`: the sea; by default, level at
+    z = 0, with the slopes in the echoes' attributes. `errors`: pose standard deviations; by default `PoseErrors`.
+    `forward`: platform's forward axis, not vertical, shape (3,) or (shots, 3). Needed where roll and pitch have
+    different errors. `view_x`, `view_y`: standard deviations of a pixel's light about its line of sight [rad], at least
+    0; they broadcast to (shots, pixels). `time_s`: times of the pulses [s], shape (shots,). A surface with planes needs
+    them.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``point``, ordered by shot, pixel and arrival: ``x``, ``y``, ``z`` [m], ``kind`` (`PointClass`), ``depth``
-        [m] below the local surface, ``intensity`` (amplitude, in the unit of the echoes), the standard deviations
-        ``x_uncertainty``, ``y_uncertainty``, ``vertical_uncertainty`` (of z), ``horizontal_uncertainty`` (root of the
-        sum of the variances of x and y) and ``depth_uncertainty`` [m], ``shot``, ``pixel``, ``return_number``,
-        ``number_of_returns``, ``flags``, ``echo`` (its place in `ECHOES`, -1 without an echo) and, with `time_s`,
-        ``gps_time`` [s]. Land and objects above the water are timed in air: their depth is negative. A waveform without
-        an echo has one point in class 45, where its line of sight meets the sea, with NaN as depth and intensity.
+    Result: over ``point``, ordered by shot, pixel and arrival: ``x``, ``y``, ``z`` [m], ``kind`` (`PointClass`),
+    ``depth`` [m] below the local surface, ``intensity`` (amplitude, in the unit of the echoes), the standard deviations
+    ``x_uncertainty``, ``y_uncertainty``, ``vertical_uncertainty`` (of z), ``horizontal_uncertainty`` (root of the sum
+    of the variances of x and y) and ``depth_uncertainty`` [m], ``shot``, ``pixel``, ``return_number``,
+    ``number_of_returns``, ``flags``, ``echo`` (its place in `ECHOES`, -1 without an echo) and, with `time_s`,
+    ``gps_time`` [s]. Land and objects above the water are timed in air: their depth is negative. A waveform without an
+    echo has one point in class 45, where its line of sight meets the sea, with NaN as depth and intensity. Raises
+    `UserError` if shapes do not agree, a pose is not orthonormal, a line of sight does not descend to the sea, or a
+    value is out of range; or if the echoes lack a variable, have several estimators, or depths from the mean sea level.
 
-    Raises
-    ------
-    UserError
-        If shapes do not agree, a pose is not orthonormal, a line of sight does not descend to the sea, or a value is
-        out of range. If the echoes lack a variable, have several estimators, or depths from the mean sea level.
-
-    Notes
-    -----
     A point is at o + R d + s w, as of `RefractedPaths`: R is the range of the pixel's surface arrival, from which
     depths count, or with planes the plane's range. Over a level sea its z is that of the surface less the depth.
 
@@ -171,17 +148,10 @@ def positions(
 def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0) -> SurfaceModel:
     """Fit the sea to the surface points of a flight.
 
-    Parameters
-    ----------
-    points
-        Points from `positions` over the whole flight; with planes they need ``gps_time``.
-    slope_deviation, radius
-        As for `SurfaceModel.fit`.
+    `points`: points from `positions` over the whole flight; with planes they need ``gps_time``. `slope_deviation`,
+    `radius`: as for `SurfaceModel.fit`.
 
-    Raises
-    ------
-    UserError
-        As `SurfaceModel.fit`, or if ``gps_time`` is missing.
+    Raises `UserError` as `SurfaceModel.fit`, or if ``gps_time`` is missing.
     """
     own = points.isel(point=points["kind"].values == PointClass.SURFACE)
     if radius > 0 and "gps_time" not in own:

@@ -31,20 +31,14 @@ from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.results.attributes import PointClass, described, flagged, label
 from mitransient_lidar.results.geometry import lidar_system
 
-#: Pulses of a chunk of a file.
-_CHUNK = 4096
-
-#: Counts of the range of all samples.
-_COUNTS = 65000
-
-#: Probability of a class below which it is uncertain.
-_CERTAIN = 0.9
+_CHUNK = 4096  #: Pulses of a chunk of a file.
+_COUNTS = 65000  #: Counts of the range of all samples.
+_CERTAIN = 0.9  #: Probability of a class below which it is uncertain.
 
 #: Rows of the printed table that are left out without points.
 _IF_ANY = ("land", "above the water", "bottom, merged", "withheld")
 
-#: Store of the infrared channel with lines of its own, beside that of the flight.
-INFRARED_STORE = "infrared.zarr"
+INFRARED_STORE = "infrared.zarr"  #: Store of the infrared channel with lines of its own, beside that of the flight.
 
 #: Variables of the store that tell the truth of a shot, and their names among those of points.
 _TRUTH = ("true_surface_height", "true_bottom_depth", "true_bottom_depth_below_surface")

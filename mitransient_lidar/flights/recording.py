@@ -14,11 +14,8 @@ from mitransient_lidar.core.validation import IntArray
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 
-#: Bins whose variances are pooled, and bins of a mean power.
-_POOLED_BINS, _MEAN_BINS = 21, 5
-
-#: Fewest passes of a shot whose own errors are known.
-_KNOWN_PASSES = 4
+_POOLED_BINS, _MEAN_BINS = 21, 5  #: Bins whose variances are pooled, and bins of a mean power.
+_KNOWN_PASSES = 4  #: Fewest passes of a shot whose own errors are known.
 
 #: Names of the inputs of pulses that hold a setting of a channel, which end in its number.
 SETTINGS = {"receiver_gain_": "factor of the gain", "receiver_density_": "optical density of the filter"}
@@ -65,12 +62,8 @@ def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray, passes: IntArray
     With fewer than four passes, all such shots together give the relative error over the 21 bins, larger beside their
     echo. A bin's own error then does not count.
 
-    Parameters
-    ----------
-    waveform, stderr
-        Mean power and its standard error, with the dimensions shot, pixel and time.
-    passes
-        Passes of each shot, shape (shots,).
+    `waveform`, `stderr`: mean power and its standard error, with the dimensions shot, pixel and time. `passes`: passes
+    of each shot, shape (shots,).
     """
     power, error = (values.transpose("shot", "pixel", "time").values for values in (waveform, stderr))
     # A mean over bins, since one that is low by chance is so in both.

@@ -14,8 +14,7 @@ from mitransient_lidar.core.validation import BoolArray, FloatArray, finite_arra
 from mitransient_lidar.flights.sea_surface import Facets, SurfaceModel
 from mitransient_lidar.physics.lidar.level_sea import cos_in_water, refract
 
-#: Ratio of errors from which a pulse's own surface replaces a plane through several.
-_CLEARLY = 2.0
+_CLEARLY = 2.0  #: Ratio of errors from which a pulse's own surface replaces a plane through several.
 
 
 @dataclass(frozen=True)
@@ -107,21 +106,11 @@ class RefractedPaths:
     ) -> RefractedPaths:
         """Trace paths.
 
-        Parameters
-        ----------
-        origin, direction
-            Positions [m] and unit directions that go down, shape (n, 3).
-        timing
-            What the echoes say.
-        classes
-            Whether a point is in the water, and whether its pulse has no echo, shape (n,).
-        indices
-            Refractive and group index.
-        surface
-            The sea. Points in the water are beyond its planes, if it has some, but beyond R_s where its error is below
-            half the plane height's. Points from pulses without an echo are on the surface.
-        time_s
-            Times [s], shape (n,).
+        `origin`, `direction`: positions [m] and unit directions that go down, shape (n, 3). `timing`: what the echoes
+        say. `classes`: whether a point is in the water, and whether its pulse has no echo, shape (n,). `indices`:
+        refractive and group index. `surface`: the sea. Points in the water are beyond its planes, if it has some, but
+        beyond R_s where its error is below half the plane height's. Points from pulses without an echo are on the
+        surface. `time_s`: times [s], shape (n,).
         """
         (in_water, silent), (n, group) = classes, indices
         on_model = silent | (in_water & (surface.points is not None))
@@ -151,16 +140,9 @@ class RefractedPaths:
     ) -> FloatArray:
         """Return the variances of x, y and z [m^2], shape (n, 3), to first order in independent errors.
 
-        Parameters
-        ----------
-        errors
-            Pose standard deviations.
-        rotations
-            Rotation vectors for roll, pitch and heading by one standard deviation [rad], shape (3, n, 3).
-        sides
-            Standard deviations of pixel light about the line of sight as vectors [rad], shape (2, n, 3).
-        slope_deviation
-            Standard deviation of slopes in the depth's method error [1].
+        `errors`: pose standard deviations. `rotations`: rotation vectors for roll, pitch and heading by one standard
+        deviation [rad], shape (3, n, 3). `sides`: standard deviations of pixel light about the line of sight as vectors
+        [rad], shape (2, n, 3). `slope_deviation`: standard deviation of slopes in the depth's method error [1].
         """
         d, w, n = self.direction, self.refracted, self.index
         normal = np.column_stack([-self.facets.slope, np.ones(len(d))])

@@ -232,7 +232,7 @@ class FlightRenderer(Renderer):
     def _passes(self, *, until_error: bool) -> tuple[int, float, float | None]:
         """Return the pulses' most passes, their share of a full pass's paths, and the error that ends them."""
         from mitransient_lidar.rendering.shots.batches import MOST_PASSES_FOR_ERROR, share_for_error
-        from mitransient_lidar.rendering.shots.pilots import MERGED_PASSES
+        from mitransient_lidar.rendering.shots.scene import MERGED_PASSES
 
         error = self.plan.target_error
         share = share_for_error(error)
@@ -243,7 +243,7 @@ class FlightRenderer(Renderer):
 
         Beside them is the processor time per flight pulse, with as many passes as its error needs [s].
         """
-        from mitransient_lidar.rendering.shots.pilots import PILOTS
+        from mitransient_lidar.rendering.shots.scene import PILOTS
 
         rows = pilot_rows(columns, PILOTS)
         group = columns["group"][rows]
@@ -297,7 +297,7 @@ class FlightRenderer(Renderer):
         The last array are the relative errors of the bins that count. `pilots`: numbers of pilot pulses.
         """
         from mitransient_lidar.rendering.shots.batches import ReceivedShots, suits_maps
-        from mitransient_lidar.rendering.shots.pilots import PILOTS, pilot_sea
+        from mitransient_lidar.rendering.shots.scene import PILOTS, pilot_sea
         from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
 
         plan = self.plan

@@ -16,14 +16,12 @@ from mitransient_lidar.core.validation import FloatArray, finite_array, non_nega
 
 #: Speed by which times become distances [m/s], that of waves of 16 m: points from another time are of other waves.
 _WAVE_SPEED = 5.0
-#: Most points of a plane, and rows in memory at a time.
-_MOST_NEIGHBOURS, _ROWS = 24, 20_000
+_MOST_NEIGHBOURS, _ROWS = 24, 20_000  #: Most points of a plane, and rows in memory at a time.
 #: Points at which the residual of planes is measured, and the residuals to choose from, relative to the waves' height.
 _SAMPLES, _RESIDUALS = 1000, 2.0 ** np.arange(-8, 1)
 #: Wave number of the waves that planes do not follow, times the root mean square distance of a plane's points.
 _WAVE_NUMBER = 1.5
-#: Probability of a smaller variance of heights than that of the points, one standard deviation below.
-_CHANCE = 0.16
+_CHANCE = 0.16  #: Probability of a smaller variance of heights than that of the points, one standard deviation below.
 #: Smallest standard deviations of heights [m] and slopes [1], so that precise points have finite weights.
 _LEAST_ERROR, _LEAST_SLOPE = 1e-6, 1e-9
 

@@ -13,8 +13,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, finite_array, integer, positive
 
-#: Reserved, user, record, bytes that follow, description.
-_HEADER = struct.Struct("<H16sHQ32s")
+_HEADER = struct.Struct("<H16sHQ32s")  #: Reserved, user, record, bytes that follow, description.
 _LENGTH_AT = 20  # position of the number of bytes that follow
 _DESCRIPTOR = struct.Struct("<BBIIdd")
 _BITS = 16
@@ -59,27 +58,16 @@ class PacketWriter:
     def append(self, waveforms: xr.Dataset, points: xr.Dataset) -> dict[str, npt.NDArray[Any]]:
         """Write packets, and return the fields of the points that refer to them.
 
-        Parameters
-        ----------
-        waveforms : xr.Dataset
-            ``waveform`` over (packet, sample): integers are counts, 0 to 65535; other numbers are volts, which become
-            counts by ``gain`` [V per count] and ``offset`` [V], NaN where a packet is shorter. These and
-            ``sampling_ns`` are its attributes, one value for a file. Missing samples become the count nearest to 0 V.
-        points : xr.Dataset
-            Over ``point``: ``packet``, packet index in `waveforms` or -1 for none; ``time_in_packet_ns``, time of the
-            point after the first sample; ``direction`` over (point, 3), unit vector of the light that arrives at the
-            point; optionally ``group_speed`` [m/s], its speed there, that of light in vacuum otherwise.
+        `waveforms`: ``waveform`` over (packet, sample): integers are counts, 0 to 65535; other numbers are volts, which
+        become counts by ``gain`` [V per count] and ``offset`` [V], NaN where a packet is shorter. These and
+        ``sampling_ns`` are its attributes, one value for a file. Missing samples become the count nearest to 0 V.
+        `points`: over ``point``: ``packet``, packet index in `waveforms` or -1 for none; ``time_in_packet_ns``, time of
+        the point after the first sample; ``direction`` over (point, 3), unit vector of the light that arrives at the
+        point; optionally ``group_speed`` [m/s], its speed there, that of light in vacuum otherwise.
 
-        Returns
-        -------
-        dict
-            Values by laspy's field name, shape (points,) each.
-
-        Raises
-        ------
-        UserError
-            If waveforms differ in their attributes, are longer than the first ones or out of range, or a point value is
-            not finite or out of range.
+        Returns `dict`: values by laspy's field name, shape (points,) each. Raises `UserError` if waveforms differ in
+        their attributes, are longer than the first ones or out of range, or a point value is not finite or out of
+        range.
         """
         counts = self._counts(waveforms["waveform"])
         fields = self._fields(points, counts.shape[0])

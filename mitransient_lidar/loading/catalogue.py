@@ -23,15 +23,7 @@ from xml.dom import minidom
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import check_regular, read_text, replacing, together
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.loading.document import (
-    SceneDocument,
-    comment_on_line,
-    drop_line,
-    parameters_of,
-    parse_part,
-    read_document,
-    text_of,
-)
+from mitransient_lidar.loading import document as documents
 from mitransient_lidar.loading.parameters import plugins_of, values_of, without_replaced
 from mitransient_lidar.transport.sensor.pixels import LayoutPixels
 
@@ -114,7 +106,7 @@ def with_infrared(
         )
     given, channel = dict(params or {}), name + _INFRARED
     own = {key: value for key, value in given.items() if not str(key).startswith(_OF_INFRARED)}
-    of_lidar = parameters_of(read_document(_path(channel)).root).keys() - {*_OF_BOTH}
+    of_lidar = documents.parameters_of(documents.read_document(_path(channel)).root).keys() - {*_OF_BOTH}
     other = {key: value for key, value in own.items() if key not in of_lidar}
     other |= {key.removeprefix(_OF_INFRARED): value for key, value in given.items() if key not in own}
     return (name, own), (channel, {"coefficients_nm": 532, **other})
@@ -122,9 +114,9 @@ def with_infrared(
 
 def instrument_text(name: str) -> str:
     """Return the XML of an instrument, self-contained, to be included by a scene; raise UserError if there is none."""
-    document = read_document(_path(name))
+    document = documents.read_document(_path(name))
     _drop_unused(document.root)
-    return text_of(document.root)
+    return documents.text_of(document.root)
 
 
 def receiver_text(name: str) -> str:
@@ -132,7 +124,7 @@ def receiver_text(name: str) -> str:
     return read_text(_path(name).with_suffix(".toml"))
 
 
-def mount(name: str, scene: SceneDocument) -> SceneDocument:
+def mount(name: str, scene: documents.SceneDocument) -> documents.SceneDocument:
     """Replace a scene's laser and receiver by an instrument's.
 
     The scene keeps its film, with the instrument's time bins, its integrator, the point at which the lidar aims, and
@@ -142,14 +134,14 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
     Raises UserError if there is no such instrument.
     """
     path = _path(name)
-    own, part = _own_part(path), read_document(path).root
+    own, part = _own_part(path), documents.read_document(path).root
     scene = scene.copied()
     root = scene.root
-    shared, former = parameters_of(part), values_of(scene)
-    values = {name: shared[name] for name in _TIME_AXIS} | parameters_of(own)
+    shared, former = documents.parameters_of(part), values_of(scene)
+    values = {name: shared[name] for name in _TIME_AXIS} | documents.parameters_of(own)
     for plugin in plugins_of(scene):
         for size in {*_SEA} & plugin.settings.keys() if plugin.declared.name == "ocean_surface" else ():
-            drop_line(plugin.settings[size].element)
+            documents.drop_line(plugin.settings[size].element)
     films = [tag for tag in root.getElementsByTagName("film") if tag.getAttribute("type") == "time_gated_film"]
     for child in list(root.childNodes):
         if isinstance(child, minidom.Element) and (
@@ -176,20 +168,20 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
     for child in list(part.childNodes):
         if not (has_integrator and isinstance(child, minidom.Element) and child.tagName == "integrator"):
             root.appendChild(child)
-    scene = replace(scene, parameters=parameters_of(root) | values, instrument=name)
+    scene = replace(scene, parameters=documents.parameters_of(root) | values, instrument=name)
     for plugin in plugins_of(scene):
         for parameter, names in plugin.names():
             # Water and bottom are those at the laser's wavelength.
             if parameter.name in names and parameter.name in values and parameter.name not in plugin.settings:
                 plugin.refer(parameter, parameter.name)
     _drop_unused(root)
-    known = {key: former.get(key, value) for key, value in parameters_of(root).items()} | values
+    known = {key: former.get(key, value) for key, value in documents.parameters_of(root).items()} | values
     return without_replaced(replace(scene, parameters=known), values)
 
 
 def _own_part(path: Path) -> minidom.Element:
     """Return the root of an instrument's file without its includes."""
-    return parse_part(read_text(path), path)
+    return documents.parse_part(read_text(path), path)
 
 
 def _keep_film(film: minidom.Element, own: minidom.Element) -> None:
@@ -217,17 +209,17 @@ def _named(parent: minidom.Element, name: str) -> list[minidom.Element]:
 def _parameters(root: minidom.Element) -> Iterator[InstrumentParameter]:
     """Yield the parameters of an instrument's file, with the comments on their lines."""
     for default in root.getElementsByTagName("default"):
-        comment = comment_on_line(default)
+        comment = documents.comment_on_line(default)
         text = "" if comment is None else " ".join(comment.data.split())
         yield InstrumentParameter(default.getAttribute("name"), default.getAttribute("value"), text)
 
 
 def _drop_unused(root: minidom.Element) -> None:
     """Remove the parameters of a scene that no element refers to, with the comments on their lines."""
-    used = SceneDocument("", root, parameters=parameters_of(root)).used
+    used = documents.SceneDocument("", root, parameters=documents.parameters_of(root)).used
     for default in root.getElementsByTagName("default"):
         if default.getAttribute("name") not in used:
-            drop_line(default)
+            documents.drop_line(default)
 
 
 def _path(name: str) -> Path:
@@ -273,7 +265,7 @@ def scene_text(name: str | os.PathLike[str]) -> str:
 
     Name as in `scene_path`; format and further errors as in `loading.document`.
     """
-    return read_document(scene_path(name)).text
+    return documents.read_document(scene_path(name)).text
 
 
 def scene_summary(name: str | os.PathLike[str]) -> str:
@@ -288,7 +280,7 @@ def scene_parameters(name: str | os.PathLike[str], *, by_id: bool = False) -> di
     Values are texts, empty for parameters without one. With `by_id`, plugin parameters have their names with ids, too.
     Name and errors as in `scene_text`.
     """
-    return values_of(read_document(scene_path(name)), by_id=by_id)
+    return values_of(documents.read_document(scene_path(name)), by_id=by_id)
 
 
 def example_files() -> dict[str, Path]:
@@ -321,7 +313,7 @@ def copy_scene(
         for copy, original in copies.items():
             with replacing(copy) as temporary:
                 if original.suffix == ".xml":
-                    temporary.write_text(read_document(original).text, encoding="utf-8")
+                    temporary.write_text(documents.read_document(original).text, encoding="utf-8")
                 else:
                     shutil.copyfile(original, temporary)
     return target
@@ -333,7 +325,7 @@ def files_named_by(source: Path) -> list[Path]:
     while left:
         file = left.pop()
         if file.suffix in (".xml", ".toml"):
-            text = read_document(file).text if file.suffix == ".xml" else read_text(file)
+            text = documents.read_document(file).text if file.suffix == ".xml" else read_text(file)
             near = (one for one in sorted(file.parent.iterdir()) if one.is_file() and one not in found)
             named = [one for one in near if f'"{one.name}"' in text]
             found += named

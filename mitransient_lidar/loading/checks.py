@@ -283,11 +283,8 @@ _TYPES = {
 #: NumPy byte orders by file format; text has none.
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
-#: Longest header and header line [bytes].
-_LONGEST_HEADER, _LONGEST_LINE = 2**20, 2**12
-
-#: Records that are checked at a time.
-_AT_ONCE = 2**17
+_LONGEST_HEADER, _LONGEST_LINE = 2**20, 2**12  #: Longest header and header line [bytes].
+_AT_ONCE = 2**17  #: Records that are checked at a time.
 
 
 class _Element(NamedTuple):

@@ -20,18 +20,14 @@ from mitransient_lidar.core.files import is_there, read_text
 from mitransient_lidar.core.formats.documents import check_xml
 from mitransient_lidar.core.validation import shown
 
-#: Most files that a scene and its parts include.
-_MOST_FILES = 256
-
-#: Deepest nesting of scene objects; Mitsuba's parser is recursive.
-DEEPEST_NESTING = 64
+_MOST_FILES = 256  #: Most files that a scene and its parts include.
+DEEPEST_NESTING = 64  #: Deepest nesting of scene objects; Mitsuba's parser is recursive.
 
 #: Represents a dollar sign that is part of a value in the text that Mitsuba parses; there every other dollar sign
 #: begins a parameter.
 DOLLAR = "\ue024"
 
-#: Most characters in an attribute with its parameter values in place.
-_LONGEST_TEXT = 10**6
+_LONGEST_TEXT = 10**6  #: Most characters in an attribute with its parameter values in place.
 
 
 class Setting(NamedTuple):

@@ -19,8 +19,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.transport.plugin_types import LidarSensor, Transmitter
 
-#: Distance from the scene's origin to the aim up to which the scene's own frame is used [m].
-_NEAR = 250.0
+_NEAR = 250.0  #: Distance from the scene's origin to the aim up to which the scene's own frame is used [m].
 
 #: This package's plugins with locations, the first ones by their aim.
 _LIDAR = ("lidar_transmitter", "multipixel_receiver", "pixel_fov")
@@ -35,8 +34,7 @@ _PLACED = (
 )
 _POINTS = {"sphere": ("center",), "cylinder": ("p0", "p1")}
 
-#: Mitsuba textures that use texture coordinates.
-_BY_COORDINATES = ("bitmap", "checkerboard")
+_BY_COORDINATES = ("bitmap", "checkerboard")  #: Mitsuba textures that use texture coordinates.
 
 #: Mitsuba plugins without a location of their own, in kinds that have one.
 _WITHOUT_PLACE = (

@@ -27,8 +27,7 @@ _OTHERS = ("rectangle", "sphere", "cylinder", "cube", "disk", "ply", "obj", "dif
 #: XML elements that set a plugin parameter, which are the parameter kinds.
 _TAGS = ("float", "integer", "boolean", "string")
 
-#: Plugins that an instrument brings.
-_LIDAR = ("lidar_transmitter", "multipixel_receiver", "pixel_fov")
+_LIDAR = ("lidar_transmitter", "multipixel_receiver", "pixel_fov")  #: Plugins that an instrument brings.
 
 
 @dataclass(frozen=True)

@@ -45,15 +45,7 @@ from mitransient_lidar.core.files import check_regular, is_file_name, is_there, 
 from mitransient_lidar.core.formats.documents import parse_json
 from mitransient_lidar.core.parameters.catalogue import FILE_PARAMETERS, PLUGINS
 from mitransient_lidar.core.validation import FloatArray, shown
-from mitransient_lidar.loading.checks import (
-    GRID_PLUGINS,
-    PLY_PLUGINS,
-    check_grid,
-    check_ply,
-    is_transform,
-    matrix_of,
-    resource_folders,
-)
+from mitransient_lidar.loading import checks
 from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
 from mitransient_lidar.loading.frame import frame_origin
 from mitransient_lidar.loading.parameters import values_of
@@ -75,8 +67,8 @@ def to_json(value: Any) -> Any:
         return str(value)
     if isinstance(value, (list, tuple)):
         return [to_json(item) for item in value]
-    if is_transform(value):
-        return {name: matrix_of(getattr(value, name)).tolist() for name in ("matrix", "inverse_transpose")}
+    if checks.is_transform(value):
+        return {name: checks.matrix_of(getattr(value, name)).tolist() for name in ("matrix", "inverse_transpose")}
     if isinstance(value, (mi.Bitmap, mi.VolumeGrid, mi.TensorXf)):
         return _stored(value)
     array = np.array(value)
@@ -136,8 +128,7 @@ def _restored(value: Mapping[str, Any]) -> Any:
     return bitmap
 
 
-#: Origin of the scene's own frame.
-_ORIGIN = np.zeros(3)
+_ORIGIN = np.zeros(3)  #: Origin of the scene's own frame.
 
 #: Largest array of a Mitsuba object whose values are stored; others, such as vertices, are in the files.
 _MOST_VALUES = 16
@@ -177,7 +168,7 @@ class SceneSource:
 
         Raises UserError as `of_document`.
         """
-        files = _found(_files_of_dict(scene), resource_folders(scene))
+        files = _found(_files_of_dict(scene), checks.resource_folders(scene))
         try:
             return cls("scene", json.dumps(to_json(scene)), False, {}, files)
         except (RuntimeError, TypeError, ValueError):
@@ -355,8 +346,8 @@ def _plain(value: Any) -> Any:
     """Return a parameter's value in JSON types: a number, a text, or a list; a transform as its matrix."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    if is_transform(value):
-        return matrix_of(value.matrix).tolist()
+    if checks.is_transform(value):
+        return checks.matrix_of(value.matrix).tolist()
     try:
         array = np.array(value)
     except (RuntimeError, TypeError, ValueError):
@@ -411,10 +402,10 @@ def _check_file(plugin: str, path: Path, _digest: str) -> None:
     """
     if printable(str(path)) != str(path):
         raise UserError(f"cannot read {path}: its name must have no control characters")
-    if plugin in PLY_PLUGINS:
-        check_ply(path)
-    if plugin in GRID_PLUGINS:
-        check_grid(path)
+    if plugin in checks.PLY_PLUGINS:
+        checks.check_ply(path)
+    if plugin in checks.GRID_PLUGINS:
+        checks.check_grid(path)
 
 
 def _copy_of(path: str, digest: str, folders: Sequence[Path]) -> str:

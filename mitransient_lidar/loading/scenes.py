@@ -186,8 +186,7 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
     return chosen
 
 
-#: Plugins with maps that may be in map coordinates.
-_WITH_MAPS = ("seabed", "ocean_surface")
+_WITH_MAPS = ("seabed", "ocean_surface")  #: Plugins with maps that may be in map coordinates.
 
 
 def read_source(

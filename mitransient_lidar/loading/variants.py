@@ -30,8 +30,7 @@ _LOG = logging.getLogger(__name__)
 #: Variants that the plugins support, in the order of preference.
 SUPPORTED_VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
 
-#: Dr.Jit 1.5 aborts the process with LLVM 15 and 16, and rejects older releases.
-OLDEST_USABLE_LLVM = 17
+OLDEST_USABLE_LLVM = 17  #: Dr.Jit 1.5 aborts the process with LLVM 15 and 16, and rejects older releases.
 
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _LLVM_WHEEL = "karellen-llvm-core"
@@ -45,9 +44,9 @@ PLUGIN_MODULES = {
     "two_term_henyey_greenstein": ("phase", "phase"),
     "layered_water": ("layered_water", "medium"),
     **dict.fromkeys(("gram_charlier_dielectric", "retroreflector", "leaf", "sediment"), ("bsdfs", "bsdf")),
-    **{name: (name, "shape") for name in ("ocean_surface", "seabed", "canopy")},
-    "lidar_transmitter": ("lidar_transmitter", "emitter"),
-    **dict.fromkeys(("sun", "sky"), ("daylight", "emitter")),
+    "ocean_surface": ("ocean_surface", "shape"),
+    **dict.fromkeys(("seabed", "canopy"), ("bottom", "shape")),
+    **dict.fromkeys(("lidar_transmitter", "sun", "sky"), ("emitters", "emitter")),
     **dict.fromkeys(("pixel_fov", "multipixel_receiver"), ("receivers", "sensor")),
     "time_gated_film": ("time_gated_film", "film"),
     **dict.fromkeys(("lidar_volpath", "lidar_merging", "passive_volpath"), ("integrators", "integrator")),
@@ -306,8 +305,7 @@ def describe() -> dict[str, str]:
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
-#: Time after which a thread that waits looks for an interruption [s].
-_LOOK_S = 0.1
+_LOOK_S = 0.1  #: Time after which a thread that waits looks for an interruption [s].
 
 
 class _Turn:

@@ -82,11 +82,8 @@ class Canopy:
 
         `side`: side of the square that contains the blades, or the leaf centres [m]. `seed`: random seed.
 
-        Returns
-        -------
-        feet, width, length : ndarray
-            Middle of each leaf's lower edge [m], and vectors along that edge and away from it, as long as the leaf is
-            wide and long [m]; shape (leaves, 3).
+        Returns `feet`, `width`, `length`: middle of each leaf's lower edge [m], and vectors along that edge and away
+        from it, as long as the leaf is wide and long [m]; shape (leaves, 3).
         """
         count = round(self.density * side * side)
         what = f"{count} leaves of leaf_area_index = {self.leaf_area_index:g} within size = {side:g} m"

@@ -23,14 +23,10 @@ from mitransient_lidar.plots import drawing, palette
 #: Sample records, most parameters and parameter pairs that are drawn, and runs that give the responses.
 _SAMPLE, _MOST_PARAMETERS, _MOST_PAIRS, _MOST_RUNS = 12, 5, 3, 20_000
 
-#: Cells per side of a response surface.
-_CELLS = 10
+_CELLS = 10  #: Cells per side of a response surface.
+_DYNAMIC_RANGE = {"waveform": 1e6, "signal": 1e4}  #: Range drawn below the peak, for powers and for noisy signals.
 
-#: Range drawn below the peak, for powers and for noisy signals.
-_DYNAMIC_RANGE = {"waveform": 1e6, "signal": 1e4}
-
-#: Flag of `analysis.waveforms.echo_detection.EchoFlag` for an echo that was not found.
-_NO_ECHO = 1
+_NO_ECHO = 1  #: Flag of `analysis.waveforms.echo_detection.EchoFlag` for an echo that was not found.
 
 _DONE = 1
 
@@ -42,10 +38,8 @@ def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, see
     parameter pairs: the mean over runs, for the share of records with a bottom echo, else for peak power, else for the
     error.
 
-    Raises UserError if no run is done, or the file name has another suffix.
-
-    `dataset`: a campaign as from `campaigns.store.open_campaign`. `path`: PNG, PDF or SVG file to write. `seed`: sample
-    seed.
+    Raises UserError if no run is done, or the file name has another suffix. `dataset`: a campaign as from
+    `campaigns.store.open_campaign`. `path`: PNG, PDF or SVG file to write. `seed`: sample seed.
     """
     figure = drawing.new_figure(path, 11.0, 9.6)
     done = np.flatnonzero(dataset["status"].values == _DONE)
@@ -90,17 +84,14 @@ def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> N
     # A logarithmic axis has no values below 0, and lower ones would be drawn as a level. So would the dark before the
     # first light: after a converter it is the code next to 0.
     values[(values < 1 / _DYNAMIC_RANGE[name]) | (values <= values[:, :1])] = np.nan
-    ax.set_yscale("log")
-    ax.set_ylim(1 / _DYNAMIC_RANGE[name], 2)
+    ax.set(yscale="log", ylim=(1 / _DYNAMIC_RANGE[name], 2))
     name_of, column = next(iter(_numbers(_inputs(dataset, runs)).items()), ("run", runs))
     # The lightest colours are hard to see on white.
     colours = ScalarMappable(Normalize(column.min(), column.max() + 0.08 * np.ptp(column)), palette.SEQUENCE)
     for line, value in zip(values, column, strict=True):
         ax.plot(time, line, color=colours.to_rgba(value), linewidth=0.9)
     ax.figure.colorbar(colours, ax=ax, label=_labelled(dataset, name_of))
-    ax.set_xlabel(drawing.TIME_LABEL)
-    ax.set_ylabel(f"{name}, relative to its peak")
-    drawing.add_grid(ax)
+    drawing.finish(ax, xlabel=drawing.TIME_LABEL, ylabel=f"{name}, relative to its peak")
 
 
 def _numbers(inputs: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:

@@ -1,4 +1,4 @@
-"""Elements shared by all figures: file, text sizes, legends, units, titles, axes and images."""
+"""Elements shared by all figures: file, text sizes, legends, units, titles, axes, panels and images."""
 
 from __future__ import annotations
 
@@ -34,8 +34,7 @@ TIME_LABEL = "time since the pulse left the transmitter (ns)"
 _RECORD_TIME = "time since the start of each waveform (ns)"
 ANGLE_X_LABEL, ANGLE_Y_LABEL = "away from nadir, angle_x (mrad)", "to the left, angle_y (mrad)"
 
-#: Most pixels that a legend lists by name.
-LISTED_PIXELS = 12
+LISTED_PIXELS = 12  #: Most pixels that a legend lists by name.
 
 _FORMATS = (".png", ".pdf", ".svg")
 _DPI = 160
@@ -237,3 +236,54 @@ def pixel_pitch(dataset: xr.Dataset) -> tuple[float, float]:
     spans = (dataset["angle_x"].isel(column=0).values, dataset["angle_y"].isel(row=0).values)
     along, across = (float(np.ptp(values)) / max(values.size - 1, 1) for values in spans)
     return along or across or 1.0, across or along or 1.0
+
+
+_COLUMNS = 3  # panels side by side
+
+
+def new_panels(
+    path: FilePath | None, count: int, size: tuple[float, float], margin: tuple[float, float], **shared: Any
+) -> tuple[Figure, list[Axes], list[Axes], list[Axes]]:
+    """Return a figure with panels, a size in inches each, at most three side by side; all, the lowest and first panels.
+
+    `margin` is added to width and height, and `shared` states which axes are.
+    """
+    columns = min(_COLUMNS, count)
+    rows = -(-count // columns)
+    figure = new_figure(path, size[0] * columns + margin[0], size[1] * rows + margin[1])
+    axes = figure.subplots(rows, columns, squeeze=False, **shared)
+    for ax in axes.flat[count:]:
+        ax.axis("off")
+    shown = list(axes.flat[:count])
+    return figure, shown, shown[-columns:], shown[::columns]
+
+
+def finish(
+    ax: Axes,
+    title: str = "",
+    *,
+    grid: Literal["both", "x"] = "both",
+    hide: tuple[str, ...] = (),
+    zero: float | None = None,
+    **given: Any,
+) -> None:
+    """Add a title, a grid and a line at a value to a panel, hide frame sides, and set labels, limits and scales."""
+    if title:
+        ax.set_title(title, fontsize="medium")
+    if zero is not None:
+        ax.axhline(zero, color="0.6", linewidth=0.8)
+    ax.set(**given)
+    add_grid(ax, grid, hide)
+
+
+def name_sides(
+    figure: Figure, lowest: Sequence[Axes], x: str, first: Sequence[Axes], y: str, title: str | None = None
+) -> None:
+    """Label the axes below and to the left of panels, and list the first one's curves on the right."""
+    for ax in lowest:
+        ax.set_xlabel(x)
+        ax.tick_params(labelbottom=True)
+    for ax in first:
+        ax.set_ylabel(y)
+    handles, labels = first[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", frameon=False, title=title)

@@ -24,20 +24,14 @@ from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.results.geometry import optional_number, pose_of
 
-#: Most cells along a side of an imager that are drawn with edges.
-_EDGED_CELLS = 16
-
-#: Largest ratio between length and width of a footprint that is drawn to scale.
-_LARGEST_ASPECT = 4.0
-
-#: Most planes through targets, and planes side by side.
-_MOST_TARGET_PLANES, _MOST_COLUMNS = 3, 3
+_EDGED_CELLS = 16  #: Most cells along a side of an imager that are drawn with edges.
+_LARGEST_ASPECT = 4.0  #: Largest ratio between length and width of a footprint that is drawn to scale.
+_MOST_TARGET_PLANES, _MOST_COLUMNS = 3, 3  #: Most planes through targets, and planes side by side.
 
 #: Heights of targets that differ by less are drawn on one plane [m], and axes that differ by less as one [m].
 _SAME_PLANE, _SAME_POINT = 0.05, 1e-3
 
-#: Longest list of target names in a title.
-_LONGEST_NAME = 32
+_LONGEST_NAME = 32  #: Longest list of target names in a title.
 
 _SHADOW_COLOUR = "#00000055"
 _LEVELS = {0.6065: "e$^{-1/2}$", 0.1353: "e$^{-2}$", 1.0: "rim"}
@@ -287,13 +281,8 @@ def _draw_image(ax: Axes, dataset: xr.Dataset, ground: _Ground) -> FloatArray:
     angles = np.meshgrid(np.linspace(far, near, rows + 1), np.linspace(left, right, columns + 1), indexing="ij")
     corners = ground.project(ground.receiver, np.stack(angles, axis=-1))
     factor, prefix = drawing.si_prefix(float(np.nanmax(energy, initial=0.0)))
-    image = ax.pcolormesh(
-        *np.moveaxis(corners, -1, 0),
-        energy / factor,
-        cmap=palette.SEQUENCE,
-        edgecolors="white" if max(rows, columns) <= _EDGED_CELLS else "none",
-        linewidth=0.5,
-    )
+    edges: dict[str, Any] = {"edgecolors": "white" if max(rows, columns) <= _EDGED_CELLS else "none", "linewidth": 0.5}
+    image = ax.pcolormesh(*np.moveaxis(corners, -1, 0), energy / factor, cmap=palette.SEQUENCE, **edges)
     image.set_clip_path(Line(outline), ax.transData)
     ax.figure.colorbar(image, ax=ax, location="bottom", shrink=0.7, aspect=35, label=f"received energy ({prefix}J)")
     return outline
@@ -345,17 +334,9 @@ def _draw_targets(ax: Axes, ground: _Ground, plane: _Plane) -> None:
         low, high = np.maximum(points.min(axis=0), first), np.minimum(points.max(axis=0), last)
         if np.any(low > high):
             continue
-        ax.annotate(
-            f"{-target['z'][1]:.3g} m",
-            # At the upper edge of the visible part: the middle may be hidden by the axis.
-            (0.5 * (low[0] + high[0]), high[1]),
-            xytext=(0, -3),
-            textcoords="offset points",
-            ha="center",
-            va="top",
-            fontsize="small",
-            **marks,
-        )
+        # At the upper edge of the visible part: the middle may be hidden by the axis.
+        place, text = (0.5 * (low[0] + high[0]), high[1]), {"ha": "center", "va": "top", "fontsize": "small", **marks}
+        ax.annotate(f"{-target['z'][1]:.3g} m", place, (0, -3), textcoords="offset points", **text)
 
 
 def _once(ax: Axes, label: str) -> str:

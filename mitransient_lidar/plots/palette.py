@@ -24,11 +24,8 @@ CATEGORIES = RED, GREEN, BLUE, BLACK, ORANGE, SKY, PURPLE = (
 #: Lines of reference, limits and truth.
 GREY = "#777777"
 
-#: Parts of a scene.
-BEAM, VIEW, SEA, BOTTOM, TARGET, LAYER = ORANGE, BLACK, SKY, RED, PURPLE, GREY
-
-#: Components of the received light.
-ORIGINS = {"surface": SKY, "water": BLUE, "bottom": BOTTOM, "target": TARGET}
+BEAM, VIEW, SEA, BOTTOM, TARGET, LAYER = ORANGE, BLACK, SKY, RED, PURPLE, GREY  #: Parts of a scene.
+ORIGINS = {"surface": SKY, "water": BLUE, "bottom": BOTTOM, "target": TARGET}  #: Components of the received light.
 
 #: Points of a flight.
 CLASSES = {

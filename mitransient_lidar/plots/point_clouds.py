@@ -19,20 +19,14 @@ from mitransient_lidar.results.attributes import PointClass
 #: Classes of solid points.
 _SOLID = (PointClass.GROUND, PointClass.UNCLASSIFIED, PointClass.BOTTOM, PointClass.OBJECT)
 
-#: Half the width of a profile's strip [m], and most waveforms in it.
-_STRIP, _MOST_WAVEFORMS = 1.5, 2000
+_STRIP, _MOST_WAVEFORMS = 1.5, 2000  #: Half the width of a profile's strip [m], and most waveforms in it.
 
 #: Heights in a profile above sea and land and below the deepest point [m], and most cell columns in its picture.
 _ABOVE, _BELOW, _COLUMNS = 1.0, 1.5, 200
 
-#: Most points of a class that are drawn large.
-_RARE = 50
-
-#: Range of a nanosecond between pulse and echo in the air [m].
-_PER_NS = 0.5e-9 * C0
-
-#: Orders of magnitude of the signals in a profile.
-_DECADES = 3.0
+_RARE = 50  #: Most points of a class that are drawn large.
+_PER_NS = 0.5e-9 * C0  #: Range of a nanosecond between pulse and echo in the air [m].
+_DECADES = 3.0  #: Orders of magnitude of the signals in a profile.
 
 
 def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
@@ -55,13 +49,9 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
     error = wet["z"].values - wet["true_z"].values
     limit = float(np.nanquantile(np.abs(error), 0.98)) if error.size else 1.0
     deepest, highest = np.quantile(wet["z"].values, [0.002, 0.99]) if error.size else (-1.0, 0.0)
+    scale = {"cmap": palette.SEQUENCE, "vmin": deepest, "vmax": highest}
     for ax, values, label, style in (
-        (
-            heights,
-            wet["z"].values,
-            "height of bottom and land (m)",
-            {"cmap": palette.SEQUENCE, "vmin": deepest, "vmax": highest},
-        ),
+        (heights, wet["z"].values, "height of bottom and land (m)", scale),
         (errors, error, "error of the height (m)", {"cmap": palette.SIGNED, "vmin": -limit, "vmax": limit}),
     ):
         drawn = ax.scatter(wet["x"].values, wet["y"].values, c=values, s=3, linewidths=0, **style)
@@ -80,14 +70,8 @@ def _draw_track(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     ax.plot(*poses.ground_point()[:, :2].T, ".", color=palette.BLUE, markersize=1.5, label="pulses at the sea level")
     ax.plot(*poses.origin[:, :2].T, color="black", linewidth=1.5, label="scanner")
     if np.any(chosen := points["true_target"].values.astype(bool)):
-        ax.plot(
-            points["x"].values[chosen],
-            points["y"].values[chosen],
-            "s",
-            color=palette.RED,
-            markersize=4,
-            label="above a target",
-        )
+        x, y = (points[name].values[chosen] for name in "xy")
+        ax.plot(x, y, "s", color=palette.RED, markersize=4, label="above a target")
     _set_map(ax, f"{len(poses.origin)} pulses")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), fontsize="small")
 

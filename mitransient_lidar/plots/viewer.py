@@ -25,12 +25,7 @@ _FOLDER, _KEPT_S = "mitransient-lidar-view-", 3600.0  # for temporary pages
 class View:
     """Page of `view`, `view_scene` or `view_points`. A notebook shows it below the cell whose last value it is.
 
-    Attributes
-    ----------
-    page : str
-        HTML text, which needs no network.
-    height : int
-        Height below a cell [CSS pixels].
+    `page`: HTML text, which needs no network. `height`: height below a cell [CSS pixels].
     """
 
     def __init__(self, page: str, name: str, height: int) -> None:
@@ -53,10 +48,7 @@ class View:
 
         The same user's files are removed an hour later by the next call, when their browser has long read them.
 
-        Raises
-        ------
-        UserError
-            If the file name does not end in ``.html``, or the file cannot be written.
+        Raises `UserError` if the file name does not end in ``.html``, or the file cannot be written.
         """
         if path is None:
             _remove_former_pages()

@@ -24,8 +24,7 @@ _SMALLEST_DEG = 0.01
 #: Most phase functions drawn for a profile, and the smallest visible step of ln(bb/b) between them.
 _MOST_FUNCTIONS, _RATIO_STEP = 8, 0.02
 
-#: Most decades on the axis of the coefficients, which may fall to 0.
-_DECADES = 5
+_DECADES = 5  #: Most decades on the axis of the coefficients, which may fall to 0.
 
 
 def plot_water(
@@ -137,14 +136,8 @@ def _draw_coefficients(ax: Axes, profile: Profile, column: WaterColumn) -> None:
     ax.set(xlim=(low / 1.6, top * 1.6), ylim=(bottom, 0.0), xlabel="coefficient (1/m)", ylabel="depth (m)")
     ax.set_xscale("log")
     count = f"{column.count} layers" if column.count > 1 else "1 layer"
-    ax.legend(
-        title=f"lines: profile, bands: {count}",
-        ncols=4,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.0),
-        frameon=False,
-        handlelength=1.4,
-    )
+    place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+    ax.legend(title=f"lines: profile, bands: {count}", ncols=4, frameon=False, handlelength=1.4, **place)
     drawing.add_grid(ax, hide=("top", "right"))
 
 
@@ -168,5 +161,4 @@ def _angles() -> FloatArray:
 def _style_phase_axes(ax: Axes) -> None:
     ax.set(xscale="log", yscale="log", xlim=(_SMALLEST_DEG, 180), xticks=[0.01, 0.1, 1, 10, 90, 180])
     ax.xaxis.set_major_formatter("{x:g}°")
-    ax.set(xlabel="scattering angle", ylabel="phase function (1/sr)")
-    drawing.add_grid(ax, hide=("top", "right"))
+    drawing.finish(ax, hide=("top", "right"), xlabel="scattering angle", ylabel="phase function (1/sr)")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import xarray as xr
@@ -17,10 +17,6 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
 from mitransient_lidar.results.waveform_files import FILE
-
-if TYPE_CHECKING:
-    import xarray as xr
-    from matplotlib.figure import Figure
 
 Scale = Literal["both", "linear", "log"]
 
@@ -48,13 +44,8 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
     axes: list[Axes] = []
     for row in range(len(panels)):
         axes.append(figure.add_subplot(grid[row, 0], sharex=axes[0] if axes else None))
-    side = figure.add_subplot(grid[:, 1])
-
     curves = _curves(dataset)
-    if is_image:
-        _draw_image(side, dataset)
-    else:
-        _draw_pixels(side, dataset)
+    (_draw_image if is_image else _draw_pixels)(figure.add_subplot(grid[:, 1]), dataset)
     for ax, panel in zip(axes, panels, strict=True):
         _draw_waveforms(ax, dataset, curves, log=panel == "log")
     for ax in axes[:-1]:
@@ -70,9 +61,8 @@ def plot_components(dataset: xr.Dataset, path: drawing.FilePath | None = None) -
 
     For a shot series, it is their mean.
 
-    Raises UserError if the result's light was not separated.
-
-    `dataset`: a result of `rendering.render.render`, or a shot series, with components. `path`: file to write.
+    Raises UserError if the result's light was not separated. `dataset`: a result of `rendering.render.render`, or a
+    shot series, with components. `path`: file to write.
     """
     name = "waveform_by_origin"
     if name not in dataset:
@@ -93,14 +83,10 @@ def plot_components(dataset: xr.Dataset, path: drawing.FilePath | None = None) -
     upper.stackplot(time, power / factor, colors=colours, labels=names, linewidth=0)
     for values, style, label in zip(power / factor, styles, names, strict=True):
         lower.plot(time, np.where(values > 0, values, np.nan), linewidth=1.3, label=label, **style)
-    lower.set_yscale("log")
-    lower.set_ylim(1e-5 * top / factor, 2 * top / factor)
-    lower.set_xlabel(drawing.TIME_LABEL)
+    lower.set(yscale="log", ylim=(1e-5 * top / factor, 2 * top / factor), xlabel=drawing.TIME_LABEL)
     for ax in (upper, lower):
-        ax.set_xlim(limits)
-        ax.set_ylabel(f"received power ({prefix}W)")
         ax.legend(frameon=False)
-        drawing.add_grid(ax, hide=("right",))
+        drawing.finish(ax, hide=("right",), xlim=limits, ylabel=f"received power ({prefix}W)")
     _add_depth_axis(upper, dataset)
     figure.suptitle(f"{_title(dataset, 'mean')}  ·  by origin", fontsize="large")
     return drawing.save(figure, path)
@@ -165,14 +151,10 @@ def _draw_waveforms(ax: Axes, dataset: xr.Dataset, curves: _Curves, *, log: bool
             drawing.draw_band(ax, time, values, spread, lowest=lowest, linewidth=1.3, **style)
         else:
             ax.plot(time, values, color=style["color"], linewidth=0.6)
-    ax.set_xlim(limits)
-    if log:
-        ax.set_yscale("log")
-        ax.set_ylim(floor / factor, top / factor * 2.0)
-    else:
-        ax.set_ylim(min(0.0, float(np.nanmin(shown, initial=0.0))) / factor, top / factor * 1.08)
-    ax.set_ylabel(f"{curves.label} ({prefix}{curves.unit})" if curves.unit != "1" else f"{curves.label} per bin")
-    drawing.add_grid(ax, hide=("right",))
+    low = floor if log else min(0.0, float(np.nanmin(shown, initial=0.0)))
+    ax.set(yscale="log" if log else "linear", ylim=(low / factor, top / factor * (2.0 if log else 1.08)))
+    label = f"{curves.label} ({prefix}{curves.unit})" if curves.unit != "1" else f"{curves.label} per bin"
+    drawing.finish(ax, hide=("right",), xlim=limits, ylabel=label)
 
 
 def _add_depth_axis(ax: Axes, dataset: xr.Dataset) -> None:
@@ -253,11 +235,8 @@ def _title(dataset: xr.Dataset, shown: str = "mean and 90 %") -> str:
     return "  ·  ".join(parts)
 
 
-#: Panel height [inch], and largest number of panels.
-_PANEL, _MOST = 1.5, 12
-
-#: Share of the largest power below which relative changes are not drawn.
-_SMALLEST = 1e-3
+_PANEL, _MOST = 1.5, 12  #: Panel height [inch], and largest number of panels.
+_SMALLEST = 1e-3  #: Share of the largest power below which relative changes are not drawn.
 
 
 def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
@@ -267,9 +246,8 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
     out bins with less than a thousandth of the largest power. Pixels share photons, so that the error of their sum is
     unknown; the band over several pixels is an upper bound, the sum of their errors.
 
-    Raises UserError if the result has no derivatives.
-
-    `dataset`: a result of `rendering.render.render` with derivatives, for one shot. `path`: file to write.
+    Raises UserError if the result has no derivatives. `dataset`: a result of `rendering.render.render` with
+    derivatives, for one shot. `path`: file to write.
     """
     name = "waveform_derivative"
     if name not in dataset or "shot" in dataset[name].dims:
@@ -299,19 +277,16 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
         ax.set_ylabel("% per %" if value else "relative")
     panels[-1].set_xlabel(drawing.TIME_LABEL)
     for ax in panels:
-        ax.set_xlim(drawing.time_limits(dataset))
-        drawing.add_grid(ax, hide=("right", "top"))
+        drawing.finish(ax, hide=("right", "top"), xlim=drawing.time_limits(dataset))
     bands = "standard errors" if dataset["waveform"].isel(time=0).size == 1 else "upper bounds of standard errors"
     text = f"change of the received power with parameters of the scene; bands, where wider than lines: {bands}"
     figure.suptitle(text, fontsize="medium")
     return drawing.save(figure, path)
 
 
-#: Pixels above which their sum is drawn: a curve of each would take minutes, and hide the others.
-_MOST_CURVES = 64
+_MOST_CURVES = 64  #: Pixels above which their sum is drawn: a curve of each would take minutes, and hide the others.
 
-#: Bins from one marker on a curve to the next one.
-_MARK_EVERY = 12
+_MARK_EVERY = 12  #: Bins from one marker on a curve to the next one.
 
 
 def plot_comparison(
@@ -336,21 +311,13 @@ def plot_comparison(
         errors = [np.zeros_like(power) for power in powers]
     for power, error, style, label in zip(powers, errors, ("-", "--"), _labels(first, second), strict=True):
         for i, mark in enumerate(marks):
-            curve = {
-                **mark,
-                "markevery": _MARK_EVERY,
-                "markersize": 3.5,
-                "linestyle": style,
-                "linewidth": 0.9,
-                "label": "_" if i else label,
-            }
-            drawing.draw_band(upper, time, power[i], 2 * error[i], lowest=1e-30, **curve)
+            curve = {**mark, "markevery": _MARK_EVERY, "markersize": 3.5, "label": "_" if i else label}
+            curve |= {"linestyle": style, "linewidth": 0.9, "lowest": 1e-30}
+            drawing.draw_band(upper, time, power[i], 2 * error[i], **curve)
     shown = powers[0][counted if are_few else counted.any(axis=0, keepdims=True)]
-    upper.set_yscale("log")
-    upper.set_ylim(0.5 * shown[shown > 0].min(), 2 * shown.max())
-    upper.set_xlim(drawing.time_limits(first))
     quantity, unit = ("energy in the gate", "J") if "gate" in first.coords else ("received power", "W")
-    upper.set_ylabel(f"{quantity}{'' if are_few else ', all pixels'} ({unit})")
+    limits = {"ylim": (0.5 * shown[shown > 0].min(), 2 * shown.max()), "xlim": drawing.time_limits(first)}
+    upper.set(yscale="log", **limits, ylabel=f"{quantity}{'' if are_few else ', all pixels'} ({unit})")
     upper.legend(frameon=False)
     if are_few:
         for z, mark in zip(outcome.z, marks, strict=True):

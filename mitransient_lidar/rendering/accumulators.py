@@ -7,31 +7,22 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, require_memory
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
-from mitransient_lidar.rendering.accuracy import (
-    ErrorCorrelation,
-    ErrorWindow,
-    LightStatistics,
-    PassStatistics,
-    received_power,
-    smoothing_bias,
-)
+from mitransient_lidar.rendering import accuracy
 from mitransient_lidar.rendering.derivatives import Differences, Parameter
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
 from mitransient_lidar.results.sum_errors import with_correlation
 from mitransient_lidar.transport.paths.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.scene import LidarScene
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 logger = logging.getLogger(__name__)
 
@@ -42,19 +33,14 @@ _BYTES_PER_PASSING_BIN, _BYTES_PER_KEPT_GATE, _BYTES_PER_DIRECT_GATE, _BYTES_PER
 #: Memory of the program, and its means and errors per pixel, and per gate that is summed directly, in all passes and
 #: when it is written, for images.
 _PROGRAM, _BYTES_PER_PIXEL, _BYTES_OF_MEANS, _BYTES_PER_WRITTEN_GATE = 0.31e9, 260.0, 16, 6
-#: Most tiles of an image.
-_MOST_TILES = 64
-#: Memory per bin in a batch of passes: its sum, and the mean in the result.
-_BYTES_PER_BATCH = 16
-
-#: Pixels from which the error of a gate is estimated.
-_ERROR_PIXELS = 4096
+_MOST_TILES = 64  #: Most tiles of an image.
+_BYTES_PER_BATCH = 16  #: Memory per bin in a batch of passes: its sum, and the mean in the result.
+_ERROR_PIXELS = 4096  #: Pixels from which the error of a gate is estimated.
 
 #: Smallest path share in a pass with smoothed images: with fewer, paths take little of the time.
 _LEAST_SHARE_OF_SMOOTH = 2**-3
 
-#: Values that are summed at a time.
-_SUMMED = 2**23
+_SUMMED = 2**23  #: Values that are summed at a time.
 
 #: A pixel is lit in a gate with this share of the energy in the gate's brightest pixels (99th percentile).
 _LIT = 0.05
@@ -68,7 +54,11 @@ class Light:
 
     def __init__(self, scene: LidarScene, separate: bool) -> None:
         self._scene, self._separate = scene, separate
-        self.whole, self.parts, self.perturbed = LightStatistics(), LightStatistics(), LightStatistics()
+        self.whole, self.parts, self.perturbed = (
+            accuracy.LightStatistics(),
+            accuracy.LightStatistics(),
+            accuracy.LightStatistics(),
+        )
 
     def add(self, energy: FloatArray, perturbed: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Add one pass's energies [J], and perturbed ones with one axis more; return the whole and its power."""
@@ -88,7 +78,7 @@ class Light:
     @functools.cached_property
     def _power_of(self) -> Callable[[FloatArray], FloatArray]:
         """Power [W] of energies [J per bin], after the pulse and the receiver's response."""
-        return received_power(self._scene)
+        return accuracy.received_power(self._scene)
 
     @property
     def arrays(self) -> tuple[FloatArray, ...]:
@@ -103,33 +93,19 @@ class Light:
 class PassAccumulator:
     """Means and standard errors over a render's passes: all light, or gates alone.
 
-    Parameters
-    ----------
-    scene, window
-        The scene, and the bins whose errors count.
-    train
-        Gates at their times, or None.
-    origins
-        Names for the separated light origins.
-    parameters, differences
-        Parameters by which light is differentiated, and the subset with central differences.
-    batches
-        Number of pass batches whose power is kept.
-    kept
-        Whether ``histograms`` are kept, ``gates`` are cut from each pass histogram, or ``direct``: accumulated in the
-        pass.
-    smooth
-        Standard deviation by which each gate's image is smoothed [pixels], or None.
-    size
-        Memory of film, means and errors, for images of the whole render [bytes]; 0 if it is unknown.
-    tiles
-        Tiles of pixels whose ``direct`` gates are accumulated in turn in each pass, or one None for all pixels.
+    `scene`, `window`: the scene, and the bins whose errors count. `train`: gates at their times, or None. `origins`:
+    names for the separated light origins. `parameters`, `differences`: parameters by which light is differentiated, and
+    the subset with central differences. `batches`: number of pass batches whose power is kept. `kept`: whether
+    ``histograms`` are kept, ``gates`` are cut from each pass histogram, or ``direct``: accumulated in the pass.
+    `smooth`: standard deviation by which each gate's image is smoothed [pixels], or None. `size`: memory of film, means
+    and errors, for images of the whole render [bytes]; 0 if it is unknown. `tiles`: tiles of pixels whose ``direct``
+    gates are accumulated in turn in each pass, or one None for all pixels.
     """
 
     def __init__(
         self,
         scene: LidarScene,
-        window: ErrorWindow,
+        window: accuracy.ErrorWindow,
         train: GateTrain | None = None,
         origins: Sequence[str] = (),
         parameters: Sequence[Parameter] = (),
@@ -141,12 +117,12 @@ class PassAccumulator:
         tiles: Sequence[range | None] = (None,),
     ) -> None:
         self.scene, self.window, self.train, self._kept, self._smooth = scene, window, train, kept, smooth
-        self._light, self._correlation = Light(scene, bool(origins)), ErrorCorrelation()
+        self._light, self._correlation = Light(scene, bool(origins)), accuracy.ErrorCorrelation()
         self._origins, self._parameters = list(origins), list(parameters)
         self._scores = sum(one.perturbation is not None for one in self._parameters)
         self._differences = differences
         self._batches: list[FloatArray] = [np.zeros(())] * batches  # power sums of every batch
-        self.gates, self._gate_slopes = PassStatistics(), PassStatistics()
+        self.gates, self._gate_slopes = accuracy.PassStatistics(), accuracy.PassStatistics()
         self.size, self.tiles = size, tiles
         #: Gates that a pass accumulates instead of time bins, or None.
         self.gate_weights: GateWeights | None = None
@@ -166,7 +142,7 @@ class PassAccumulator:
             differences.cut(train)
 
     @property
-    def _received(self) -> PassStatistics:
+    def _received(self) -> accuracy.PassStatistics:
         """Statistics for all kept energy; energy in overlapping gates is added up."""
         return self._light.whole.energy if self._kept == "histograms" else self.gates
 
@@ -228,7 +204,7 @@ class PassAccumulator:
         energy, stderr = self.gates.mean, self.gates.stderr
         change = self._smoothed(energy) - energy
         lit = energy > _LIT * np.nanpercentile(energy, 99, axis=0)
-        return smoothing_bias(change, stderr, energy, lit)
+        return accuracy.smoothing_bias(change, stderr, energy, lit)
 
     def require_light(self, passes: int) -> None:
         """Raise UserError if all passes' record is empty; values that are not finite count as light."""
@@ -326,7 +302,7 @@ def described(parameters: Sequence[Parameter]) -> list[list[Any]]:
 
 def choose_accumulator(
     scene: LidarScene,
-    window: ErrorWindow,
+    window: accuracy.ErrorWindow,
     surface_time_ns: float | None,
     max_memory: float,
     origins: Sequence[str] = (),

@@ -16,14 +16,12 @@ from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.transport.probe import Probe
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Pixels darker than this fraction of the median are excluded from the radiance errors.
-_DARK_PIXEL = 1e-2
+_DARK_PIXEL = 1e-2  #: Pixels darker than this fraction of the median are excluded from the radiance errors.
 
 #: Noise in the estimated bias of smoothing over the smoothed image's noise, squared, where pixels share no noise.
 _NOISE_OF_BIAS = 1 / 6
 
-#: Values of an array that are added at a time.
-_PART = 2**17
+_PART = 2**17  #: Values of an array that are added at a time.
 
 #: Most bin blocks, and about as many pixels, over which error correlation is measured.
 _BLOCKS, _CORRELATED_PIXELS = 512, 1024
@@ -92,12 +90,8 @@ def smoothing_bias(change: FloatArray, stderr: FloatArray, light: FloatArray, li
     A second smoothing changes a smooth image as the first one has changed the true image, to first order. Its noise is
     subtracted as if pixels were independent. Structure much finer than the smoothing is not seen.
 
-    Parameters
-    ----------
-    change, stderr
-        Change by a second smoothing of the smoothed part, and the part's standard error, shape (pixels, ...).
-    light, lit
-        All light, and which pixels count, in the same shape.
+    `change`, `stderr`: change by a second smoothing of the smoothed part, and the part's standard error, shape (pixels,
+    ...). `light`, `lit`: all light, and which pixels count, in the same shape.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         square = np.sum((change**2 - _NOISE_OF_BIAS * stderr**2) / light**2, axis=0, where=lit) / lit.sum(axis=0)

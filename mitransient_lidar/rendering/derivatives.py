@@ -26,14 +26,9 @@ from mitransient_lidar.transport.perturbations import Perturbation
 from mitransient_lidar.transport.plugin_types import SeabedShape, SeaShape
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Largest number of parameters in a render.
-MOST_PARAMETERS = 64
-
-#: Derivative estimate for parameters without path sums.
-DIFFERENCES = "central differences"
-
-#: Laser divergence.
-DIVERGENCE = "divergence_mrad"
+MOST_PARAMETERS = 64  #: Largest number of parameters in a render.
+DIFFERENCES = "central differences"  #: Derivative estimate for parameters without path sums.
+DIVERGENCE = "divergence_mrad"  #: Laser divergence.
 
 #: Ripple slope variance, and the relative step of its numerical derivative.
 RIPPLES, _RIPPLE_STEP = "ripple_variance", 0.005
@@ -191,8 +186,7 @@ def _uniform_reflectance(solid: mi.Shape) -> float | None:
 #: have a step longer by a factor.
 _SHIFT_PER_WIDTH, _LAYER_FACTOR = 0.05, 2.0
 
-#: Step for other lengths [m].
-_LENGTH_STEP = 0.05
+_LENGTH_STEP = 0.05  #: Step for other lengths [m].
 
 #: Steps for beams and views, and for all others, over the value; and steps where that is 0.
 _VIEW_STEP, _RELATIVE_STEP, _STEP_FROM_ZERO = 0.1, 0.01, 0.01

@@ -26,17 +26,10 @@ from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
 from mitransient_lidar.transport.solids import box_rays, scene_of_shapes
 
-#: Largest number of pixels whose outlines are stored.
-_MOST_PIXELS = 256
-
-#: Longest attribute text; NetCDF files limit it to 64 KiB.
-_LONGEST_TEXT = 60_000
-
-#: Largest distance of simplified outlines from their points, relative to the size.
-_TOLERANCE = 5e-4
-
-#: Most samples of a pulse.
-_MOST_SAMPLES = 1000
+_MOST_PIXELS = 256  #: Largest number of pixels whose outlines are stored.
+_LONGEST_TEXT = 60_000  #: Longest attribute text; NetCDF files limit it to 64 KiB.
+_TOLERANCE = 5e-4  #: Largest distance of simplified outlines from their points, relative to the size.
+_MOST_SAMPLES = 1000  #: Most samples of a pulse.
 
 #: Shapes with points that Mitsuba samples; rays find those of others. Numbers of both along each side.
 _SAMPLED, SAMPLED_TICKS = ("Sphere", "Disk", "Cylinder", "Rectangle"), 64

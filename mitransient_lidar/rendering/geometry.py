@@ -202,8 +202,7 @@ _MOST_PIXELS, _MOST_LINES = 64, 17
 #: Length of rays that meet nothing under water, and depth of those from the air in a scene without solids [m].
 _REACH, _DEPTH = 20.0, 10.0
 
-#: Smallest sine below the horizon of rays that are followed.
-_SMALLEST_DESCENT = 1e-3
+_SMALLEST_DESCENT = 1e-3  #: Smallest sine below the horizon of rays that are followed.
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,14 +47,8 @@ def fit_to_time(
     enters the water [ns]. `seed`, `gates`: arguments of `PassRenderer.render_pass` for the first pass. `tiles`: tiles
     of pixels in each pass, or None for all.
 
-    Returns
-    -------
-    renderer
-        Renderer for the passes.
-    share
-        Its share of a full pass's paths.
-    first
-        Record of the first pass, if it is rendered already, without tiles.
+    Returns `renderer`: renderer for the passes. `share`: its share of a full pass's paths. `first`: record of the first
+    pass, if it is rendered already, without tiles.
     """
     paths = renderer.path_count
     if paths * _rays_per_path(renderer.scene, start_ns) < 2 * max_time * _RAYS_PER_SECOND:

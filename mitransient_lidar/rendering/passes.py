@@ -15,14 +15,9 @@ from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.options import Option, declared, positive_option
 from mitransient_lidar.core.validation import FloatArray
 
-#: Largest number of passes allowed.
-MOST_PASSES = 10**9
-
-#: Memory for histograms, unless another one is requested [GB].
-DEFAULT_MAX_MEMORY_GB = 2.0
-
-#: Smallest share of a full pass's paths.
-SMALLEST_SHARE = 2**-9
+MOST_PASSES = 10**9  #: Largest number of passes allowed.
+DEFAULT_MAX_MEMORY_GB = 2.0  #: Memory for histograms, unless another one is requested [GB].
+SMALLEST_SHARE = 2**-9  #: Smallest share of a full pass's paths.
 
 TargetError = Annotated[
     float | None,
@@ -61,8 +56,7 @@ Derivatives = Annotated[
 Batches = Annotated[
     int | None,
     Option(
-        "Also keep this many batch waveforms, from which a fit to the result takes its error correlation",
-        *(2, 256),
+        "Also keep this many batch waveforms, from which a fit to the result takes its error correlation", *(2, 256)
     ),
 ]
 Smooth = Annotated[
@@ -84,8 +78,7 @@ LightOption = Annotated[str, Option(_LIGHT, form="|".join(LIGHT))]
 Light = Annotated[
     str | None,
     Option(
-        f"{_LIGHT}; level for a first look in about a second: maps below a level sea",
-        form="|".join(LIGHT_OF_RENDERS),
+        f"{_LIGHT}; level for a first look in about a second: maps below a level sea", form="|".join(LIGHT_OF_RENDERS)
     ),
 ]
 Variant = Annotated[str | None, Option("Mitsuba variant, e.g. llvm_ad_mono")]
@@ -135,8 +128,7 @@ class RenderOptions:
 
 logger = logging.getLogger(__name__)
 
-#: Share of the energy lost at the surface mesh's edge above which a warning is given.
-TOLERATED_LOSS = 1e-3
+TOLERATED_LOSS = 1e-3  #: Share of the energy lost at the surface mesh's edge above which a warning is given.
 
 #: Fewest passes to compare a standard error with the target; its own relative error is then 27 %.
 SMALLEST_PASS_COUNT = 8
@@ -308,32 +300,15 @@ def run_passes(
 
     Warns when the passes or the time end before the requested error is reached, or the time before the passes.
 
-    Parameters
-    ----------
-    render_pass
-        Called with each pass's number and seed; returns the energy lost at the surface mesh's edge [J].
-    goal
-        Render end.
-    seed
-        Render seed, a 64-bit integer with a sign.
-    errors
-        Returns the relative standard errors, an array with any size; called from the second pass on.
-    errors_of
-        Unit to which the errors belong: ``bins``, ``gates`` or ``pixels``.
-    verify
-        Called with the number of passes at 8 passes, and at the end; raises UserError if the result is useless.
-    smallest
-        Number of passes that a result needs, at least 2: no goal ends the render before, and a Ctrl-C is raised, after
-        the second pass.
-    progress
-        Called after every pass.
+    `render_pass`: called with each pass's number and seed; returns the energy lost at the surface mesh's edge [J].
+    `goal`: render end. `seed`: render seed, a 64-bit integer with a sign. `errors`: returns the relative standard
+    errors, an array with any size; called from the second pass on. `errors_of`: unit to which the errors belong:
+    ``bins``, ``gates`` or ``pixels``. `verify`: called with the number of passes at 8 passes, and at the end; raises
+    UserError if the result is useless. `smallest`: number of passes that a result needs, at least 2: no goal ends the
+    render before, and a Ctrl-C is raised, after the second pass. `progress`: called after every pass.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        On a Ctrl-C during the first passes.
-    UserError
-        From `verify`, or if memory runs out.
+    Raises `KeyboardInterrupt` on a Ctrl-C during the first passes. Raises `UserError` from `verify`, or if memory runs
+    out.
     """
     count, lost, interrupted = 0, 0.0, False
     median = p95 = error = None

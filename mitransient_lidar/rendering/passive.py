@@ -21,33 +21,16 @@ from mitransient_lidar.loading.scene_source import SceneSource
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.clear_sky import background_power
+from mitransient_lidar.rendering import passes as engine
 from mitransient_lidar.rendering.accuracy import PassStatistics, RatioStatistics, smoothing_bias
-from mitransient_lidar.rendering.passes import (
-    MOST_PASSES,
-    TOLERATED_LOSS,
-    Goal,
-    MaxTime,
-    PassLog,
-    ProgressCallback,
-    SignedSeed,
-    TargetError,
-    TargetQuantile,
-    Variant,
-    pass_seed,
-    run_passes,
-    warn_of_edge_loss,
-)
 from mitransient_lidar.results.attributes import label, titled
 from mitransient_lidar.transport.daylight.renderer import DaylightRenderer, pixel_solid_angles, share_outside_surface
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 
 logger = logging.getLogger(__name__)
 
-#: Default end of a frame.
-DEFAULT_GOAL = Goal(target_error=0.05, max_time=120.0)
-
-#: Largest number of frames.
-MOST_FRAMES = 10_000
+DEFAULT_GOAL = engine.Goal(target_error=0.05, max_time=120.0)  #: Default end of a frame.
+MOST_FRAMES = 10_000  #: Largest number of frames.
 
 #: Memory per pixel in a frame's passes, and per pixel of an image that is kept, and labelled at the end [bytes].
 _BYTES_PER_PIXEL, _BYTES_PER_FRAME = 150, 60
@@ -63,14 +46,14 @@ def render_passive(
     *,
     sensor: Sensor = None,
     integrator: str | Mapping[str, Any] | None = None,
-    target_error: TargetError = None,
-    target_quantile: TargetQuantile = None,
-    max_time: MaxTime = None,
+    target_error: engine.TargetError = None,
+    target_quantile: engine.TargetQuantile = None,
+    max_time: engine.MaxTime = None,
     passes: Annotated[
         int | Sequence[int] | None,
-        Option("Stop after this many passes, by default at the target error", 2, MOST_PASSES),
+        Option("Stop after this many passes, by default at the target error", 2, engine.MOST_PASSES),
     ] = None,
-    seed: SignedSeed = None,
+    seed: engine.SignedSeed = None,
     frames: Annotated[int, Option("Number of animation frames, by default 1", 1, MOST_FRAMES)] = 1,
     frame_step_s: Annotated[
         float, Option("Time between frames, by default 0.1", 0, unit="s", above=True, flag="--frame-step")
@@ -86,8 +69,8 @@ def render_passive(
             *(0.2, 20),
         ),
     ] = None,
-    variant: Variant = None,
-    progress: ProgressCallback | None = None,
+    variant: engine.Variant = None,
+    progress: engine.ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render the radiance that the receiver sees by daylight.
 
@@ -129,7 +112,7 @@ def render_passive(
     counts: list[Any] = list(passes) if isinstance(passes, (list, tuple)) else [passes] * frames
     if len(counts) != frames:
         raise UserError(f"passes = {shown(passes)} must be one number, or {frames}, one a frame")
-    goals = [Goal.from_options(target_error, max_time, count, DEFAULT_GOAL, target_quantile) for count in counts]
+    goals = [engine.Goal.from_options(target_error, max_time, count, DEFAULT_GOAL, target_quantile) for count in counts]
     rendered: list[int] = []
     biases: list[float] = []
     images: list[tuple[FloatArray, FloatArray]] = []
@@ -148,7 +131,7 @@ def render_passive(
             described, first, etendue = _describe(renderer), session, _etendue(renderer)
         try:
             statistics, log, share, bias = _render_frame(
-                renderer, goals[frame], pass_seed(seed, frame), progress, smooth
+                renderer, goals[frame], engine.pass_seed(seed, frame), progress, smooth
             )
         except KeyboardInterrupt:
             if not images:
@@ -163,7 +146,7 @@ def render_passive(
         last, lost, interrupted = log, max(lost, share), log.interrupted
         if interrupted:
             break
-    warn_of_edge_loss(lost)
+    engine.warn_of_edge_loss(lost)
     attributes = first.attributes(
         integrator=chosen,
         **{**last.attributes(seed), "interrupted": int(interrupted)},
@@ -212,8 +195,12 @@ def _labelled(
 
 
 def _render_frame(
-    renderer: DaylightRenderer, goal: Goal, seed: int, progress: ProgressCallback | None, smooth: float | None
-) -> tuple[RatioStatistics, PassLog, float, float]:
+    renderer: DaylightRenderer,
+    goal: engine.Goal,
+    seed: int,
+    progress: engine.ProgressCallback | None,
+    smooth: float | None,
+) -> tuple[RatioStatistics, engine.PassLog, float, float]:
     """Render one frame's passes; return statistics, log, light share lost at the surface's edge, and bias.
 
     The bias is the smoothed images' bias, else NaN.
@@ -242,7 +229,7 @@ def _render_frame(
                 f"no daylight reached the receiver in {passes} passes: its field of view must see sea or sky"
             )
 
-    log = run_passes(
+    log = engine.run_passes(
         render_pass,
         goal,
         seed=seed,
@@ -310,7 +297,7 @@ def _describe(renderer: DaylightRenderer) -> dict[str, Any]:
     """Return receiver and daylight attributes; warn about a field of view beyond the surface."""
     scene, receiver = renderer.scene, renderer.scene.receiver
     outside = share_outside_surface(scene, renderer.sampler)
-    if outside > TOLERATED_LOSS:
+    if outside > engine.TOLERATED_LOSS:
         logger.warning("%.2g %% of the view passes outside the surface; enlarge the surface's size", 100 * outside)
     described = {
         "layout": receiver.pixels.layout,

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
+import xarray
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
@@ -17,33 +18,12 @@ from mitransient_lidar.loading.catalogue import with_infrared
 from mitransient_lidar.loading.scenes import LoadedScene, choose_integrator, open_scene
 from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.rendering import again
+from mitransient_lidar.rendering import passes as engine
 from mitransient_lidar.rendering.accumulators import choose_accumulator, share_of_pass
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.derivatives import Differences, path_parameters, perturbations
 from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
 from mitransient_lidar.rendering.pass_size import describe_cost, fit_to_time
-from mitransient_lidar.rendering.passes import (
-    DEFAULT_MAX_MEMORY_GB,
-    SMALLEST_PASS_COUNT,
-    TOLERATED_LOSS,
-    Batches,
-    Components,
-    Derivatives,
-    Goal,
-    Light,
-    MaxMemory,
-    MaxTime,
-    Passes,
-    ProgressCallback,
-    RenderOptions,
-    SignedSeed,
-    Smooth,
-    TargetError,
-    TargetQuantile,
-    Variant,
-    run_passes,
-    warn_of_edge_loss,
-)
 from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.rendering.scene_checks import check_scene, warn_of_shadows
 from mitransient_lidar.rendering.shots.frames import render_frames
@@ -54,14 +34,11 @@ from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, 
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
-if TYPE_CHECKING:
-    import xarray
-
 logger = logging.getLogger(__name__)
 
 #: Default render ends without and with gates.
-DEFAULT_GOAL = Goal(target_error=0.03, max_time=300.0)
-DEFAULT_GATE_GOAL = Goal(target_error=0.1, max_time=60.0)
+DEFAULT_GOAL = engine.Goal(target_error=0.03, max_time=300.0)
+DEFAULT_GATE_GOAL = engine.Goal(target_error=0.1, max_time=60.0)
 
 
 @checked
@@ -74,20 +51,20 @@ def render(
     infrared: Infrared = False,
     sensor: Sensor = None,
     integrator: Annotated[Any, Option("Integrator, by default the scene's")] = None,
-    target_error: TargetError = None,
-    target_quantile: TargetQuantile = None,
-    max_time: MaxTime = None,
-    passes: Passes = None,
-    seed: SignedSeed = None,
-    max_memory: MaxMemory = None,
+    target_error: engine.TargetError = None,
+    target_quantile: engine.TargetQuantile = None,
+    max_time: engine.MaxTime = None,
+    passes: engine.Passes = None,
+    seed: engine.SignedSeed = None,
+    max_memory: engine.MaxMemory = None,
     pass_share: float | None = None,
-    components: Components = None,
-    derivatives: Derivatives = None,
-    batches: Batches = None,
-    smooth: Smooth = None,
-    light: Light = None,
-    variant: Variant = None,
-    progress: ProgressCallback | None = None,
+    components: engine.Components = None,
+    derivatives: engine.Derivatives = None,
+    batches: engine.Batches = None,
+    smooth: engine.Smooth = None,
+    light: engine.Light = None,
+    variant: engine.Variant = None,
+    progress: engine.ProgressCallback | None = None,
     **others: Any,
 ) -> xarray.Dataset:
     """Render a lidar scene in independent passes until it is accurate enough, or a result again.
@@ -176,7 +153,7 @@ def render(
     8 passes contain the mean in 91 to 93 % of the bins; in fewer where it is larger.
     """
     derivatives = [derivatives] if isinstance(derivatives, str) else derivatives
-    options = {name: value for name, value in locals().items() if name in RenderOptions.__dataclass_fields__}
+    options = {name: value for name, value in locals().items() if name in engine.RenderOptions.__dataclass_fields__}
     if infrared:
         if again.is_result(scene):
             raise UserError("infrared = True needs a scene: a result of both channels is rendered again with both")
@@ -189,7 +166,7 @@ def render(
         result: Any = scene
         given: dict[str, Any] = {"params": params, "instrument": instrument, "sensor": sensor, "integrator": integrator}
         return render_again(result, **given, progress=progress, **options, **others)
-    chosen = RenderOptions(**options, **others)
+    chosen = engine.RenderOptions(**options, **others)
     session = open_scene(scene, params, instrument, variant=chosen.variant, sensor=sensor)
     return _render(session, integrator, chosen, progress)
 
@@ -205,10 +182,7 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
     the shots that were completed before Ctrl-C. `options`: options of the function that rendered the result, by default
     the values in its attributes. `params` are added to its scene's parameters.
 
-    Returns
-    -------
-    xarray.Dataset
-        As from the function that rendered the result.
+    Result: as from the function that rendered the result.
     """
     import xarray
 
@@ -228,12 +202,12 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
 def _render(
     session: LoadedScene,
     integrator: str | Mapping[str, Any] | mi.Integrator | None,
-    options: RenderOptions,
-    progress: ProgressCallback | None,
+    options: engine.RenderOptions,
+    progress: engine.ProgressCallback | None,
 ) -> xarray.Dataset:
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
-    max_memory = options.max_memory or DEFAULT_MAX_MEMORY_GB
+    max_memory = options.max_memory or engine.DEFAULT_MAX_MEMORY_GB
     if components:
         check_solids(sum(not shape.is_medium_transition() for shape in session.scene.shapes()))
     sensor, chosen = session.sensor, choose_integrator(session.scene, integrator)
@@ -273,8 +247,10 @@ def _render(
         renderer.memory,
     )
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
-    default = Goal(passes=SMALLEST_PASS_COUNT) if is_level else default
-    goal = Goal.from_options(options.target_error, options.max_time, options.passes, default, options.target_quantile)
+    default = engine.Goal(passes=engine.SMALLEST_PASS_COUNT) if is_level else default
+    goal = engine.Goal.from_options(
+        options.target_error, options.max_time, options.passes, default, options.target_quantile
+    )
     full = renderer.for_smoothing(share_of_pass(options.smooth)) if options.smooth else renderer
     fitted = full if share == 1 else full.scaled(share)
     if lidar.receiver.is_imager:
@@ -299,7 +275,7 @@ def _render(
             differences.add_pass(seed, share)
         return lost
 
-    log = run_passes(
+    log = engine.run_passes(
         render_pass,
         goal,
         seed=seed,
@@ -311,14 +287,14 @@ def _render(
     if lidar.receiver.is_imager:
         dr.flush_malloc_cache()  # Dr.Jit keeps the memory of passes
     missed = renderer.probe.echoes.missed_beam
-    if lidar.surfaces and missed > TOLERATED_LOSS:
+    if lidar.surfaces and missed > engine.TOLERATED_LOSS:
         logger.warning(
             "the surface is smaller than the footprint: %.2g %% of the beam in the field of view passes outside it; "
             "enlarge the surface's size",
             100 * missed,
         )
     lost = log.edge_loss_share(accumulator.received)
-    warn_of_edge_loss(lost)
+    engine.warn_of_edge_loss(lost)
     attributes = session.attributes(
         lidar,
         chosen,

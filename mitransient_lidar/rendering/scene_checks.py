@@ -25,17 +25,10 @@ logger = logging.getLogger(__name__)
 #: Axis distance that is reported, over the radii of beam and view, whichever is larger.
 _APART_PER_BEAM, _APART_PER_VIEW = 0.5, 0.15
 
-#: Heights at which the distance of the axes is compared.
-_HEIGHTS = 64
-
-#: Sum of a mesh's areas over their absolute values, below which it is closed.
-_CLOSED = 1e-3
-
-#: Most shapes out of view or outside the beam that are named.
-_MOST_NAMED = 5
-
-#: Longest echo in widths of the pulse and of the receiver's response.
-_PULSES = 5.0
+_HEIGHTS = 64  #: Heights at which the distance of the axes is compared.
+_CLOSED = 1e-3  #: Sum of a mesh's areas over their absolute values, below which it is closed.
+_MOST_NAMED = 5  #: Most shapes out of view or outside the beam that are named.
+_PULSES = 5.0  #: Longest echo in widths of the pulse and of the receiver's response.
 
 
 def check_scene(probe: Probe) -> None:

@@ -35,8 +35,7 @@ def _read() -> dict[str, tuple[str, str]]:
 
 VARIABLES = _read()
 
-#: Directions of coordinates that count downwards.
-_DOWN = ("gate_depth", "depth")
+_DOWN = ("gate_depth", "depth")  #: Directions of coordinates that count downwards.
 
 
 class PointClass(IntEnum):
@@ -93,10 +92,7 @@ def label(dataset: xr.Dataset, kind: str = "", **units: str) -> xr.Dataset:
 def flagged(meanings: type[IntEnum] | type[IntFlag]) -> dict[str, Any]:
     """Return the attributes for a variable whose values, or bits in flags, are an enum's members."""
     key = "flag_masks" if issubclass(meanings, IntFlag) else "flag_values"
-    return {
-        key: [int(one) for one in meanings],
-        "flag_meanings": " ".join(str(one.name).lower() for one in meanings),
-    }
+    return {key: [int(one) for one in meanings], "flag_meanings": " ".join(str(one.name).lower() for one in meanings)}
 
 
 _POSITIVE, _NOT_NEGATIVE, _ANY, _INDEX = (1e-30, 1e30), (0.0, 1e30), (-1e30, 1e30), (1.0, 10.0)
@@ -117,8 +113,7 @@ _NUMBERS: dict[str, tuple[float, float]] = {
 #: Attributes that are a list over the pixels where they differ.
 PER_PIXEL = ("gain", "optical_density", "background_power_w", "fitting_gain", "fitting_optical_density")
 
-#: Those that count something, which is known.
-_COUNTS = ("passes", "most_passes", "pulses", "shots")
+_COUNTS = ("passes", "most_passes", "pulses", "shots")  #: Those that count something, which is known.
 
 #: Number of values in attributes that are lists of finite numbers, None for any.
 _LISTS: dict[str, int | None] = {

@@ -29,8 +29,7 @@ from mitransient_lidar.results.geometry import optional_number
 
 _LOG = logging.getLogger(__name__)
 
-#: Variables in a result.
-LIGHT = ("impulse_response", "impulse_response_stderr", "waveform", "waveform_stderr")
+LIGHT = ("impulse_response", "impulse_response_stderr", "waveform", "waveform_stderr")  #: Variables in a result.
 _TIME_TOLERANCE = 1e-3  # of a bin, between the time coordinate and the attributes
 _NAMED_PIXELS = 5  # largest number of pixels listed in a warning
 
@@ -48,21 +47,11 @@ def build(
     Non-finite values are kept; a warning lists their pixels. Raises `ValueError` if names repeat, a number is out of
     range or an attribute has an unsupported type.
 
-    Parameters
-    ----------
-    arrays : array-like of shape (pixel, time)
-        Received energy and its standard error [J per bin], and received power after the pulse and the receiver's
-        response and its standard error [W].
-    time : TimeAxis
-        The time bins.
-    pixel_names : sequence of str
-        Unique pixel names; unused with `grid`.
-    pixel_centres_mrad : array-like of shape (pixel, 2)
-        Pixel centres' tangent-plane angles (angle_x, angle_y) [mrad].
-    grid : tuple of int, optional
-        An imager's rows and columns, with pixels in row-major order.
-    attributes : mapping of str to int, float, str or a list of those
-        The render's parameters and outcome; they override the attributes set here (``title``, ``history``, ...).
+    `arrays`, shape (pixel, time): received energy and its standard error [J per bin], and received power after the
+    pulse and the receiver's response and its standard error [W]. `time`: the time bins. `pixel_names`: unique pixel
+    names; unused with `grid`. `pixel_centres_mrad`, shape (pixel, 2): pixel centres' tangent-plane angles (angle_x,
+    angle_y) [mrad]. `grid`: an imager's rows and columns, with pixels in row-major order. `attributes`: the render's
+    parameters and outcome; they override the attributes set here (``title``, ``history``, ...).
     """
     bins = {"time_start_ns": finite("time_start_ns", time.start_ns)}
     bins["bin_width_ns"] = positive("bin_width_ns", time.bin_width_ns)

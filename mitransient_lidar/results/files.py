@@ -18,13 +18,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path, open_file, replacing
-from mitransient_lidar.core.formats.array_files import (
-    EXR_SIGNATURE,
-    check_hdf5,
-    check_size,
-    damaged_file,
-    largest_result,
-)
+from mitransient_lidar.core.formats import array_files
 from mitransient_lidar.core.formats.documents import parse_json
 from mitransient_lidar.core.marks import LONGEST_TAIL
 from mitransient_lidar.core.validation import shown
@@ -38,8 +32,7 @@ from mitransient_lidar.results.gate_stack import check_stack, has_frames
 #: Beginning of this package's files, and the mark before their SHA-256 at the end.
 SIGNATURE, _CHECKSUM = b"\x89HDF\r\n\x1a\n", b"mitransient-lidar sha256 "
 
-#: Attribute with the JSON of those that are not file attributes.
-OTHERS = "mitransient_lidar"
+OTHERS = "mitransient_lidar"  #: Attribute with the JSON of those that are not file attributes.
 
 #: Datasets that are written to the disk directly [bytes], and reserved space over their size.
 _LARGE, _RESERVED = 2**28, 1.1
@@ -145,8 +138,8 @@ def read_netcdf(path: str | os.PathLike[str]) -> tuple[xr.Dataset, bool]:
 
     damaged = f"{path} is damaged or truncated: its NetCDF data cannot be read."
     check_sum(path)
-    with damaged_file(damaged):
-        check_hdf5(path)
+    with array_files.damaged_file(damaged):
+        array_files.check_hdf5(path)
     dataset, foreign = _group(path, None, damaged)
     with h5py.File(path, "r") as file:
         has_infrared = isinstance(file.get(INFRARED), h5py.Group)
@@ -157,8 +150,11 @@ def read_netcdf(path: str | os.PathLike[str]) -> tuple[xr.Dataset, bool]:
 
 def _group(path: str | os.PathLike[str], group: str | None, damaged: str) -> tuple[xr.Dataset, bool]:
     """Return the dataset in a file, or in a group in it, and whether another program has written it."""
-    with damaged_file(damaged), xr.open_dataset(path, group=group, engine="h5netcdf", decode_times=False) as file:
-        check_size(path, file.nbytes, largest_result())
+    with (
+        array_files.damaged_file(damaged),
+        xr.open_dataset(path, group=group, engine="h5netcdf", decode_times=False) as file,
+    ):
+        array_files.check_size(path, file.nbytes, array_files.largest_result())
         dataset = file.load().drop_encoding()
         foreign = OTHERS not in dataset.attrs
         others = parse_json(dataset.attrs.pop(OTHERS, "{}"), f"the attribute {OTHERS} of {path}")
@@ -231,20 +227,12 @@ def open(path: str | os.PathLike[str], **selection: Any) -> xr.Dataset:
 def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a dataset to a file atomically; an existing file is replaced.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Any dataset of this package for a NetCDF file; a result without further variables, a gate stack or images by
-        daylight for an EXR file.
-    path : path
-        Its suffix is the format: ``.nc`` is NetCDF-4, ``.exr`` OpenEXR; for gates and frames ``.tif`` and ``.png`` are
-        16-bit images, which `open` does not read (`image_files.write`). Without a suffix, a gate stack becomes a
-        sequence of EXR files ``<path>_gate000.exr`` and so on, one per gate.
+    `dataset`: any dataset of this package for a NetCDF file; a result without further variables, a gate stack or images
+    by daylight for an EXR file. `path`: its suffix is the format: ``.nc`` is NetCDF-4, ``.exr`` OpenEXR; for gates and
+    frames ``.tif`` and ``.png`` are 16-bit images, which `open` does not read (`image_files.write`). Without a suffix,
+    a gate stack becomes a sequence of EXR files ``<path>_gate000.exr`` and so on, one per gate.
 
-    Raises
-    ------
-    UserError
-        If the suffix is another one, the format cannot store the dataset, or the file cannot be written.
+    Raises `UserError` if the suffix is another one, the format cannot store the dataset, or the file cannot be written.
     """
     if not isinstance(dataset, xr.Dataset):
         raise UserError(f"dataset = {shown(dataset)} must be a dataset, an xarray.Dataset")
@@ -294,9 +282,9 @@ def is_exr(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is an EXR file, not a NetCDF-4 one; raise `UserError` if it is neither."""
     with open_file(path) as file:
         signature = file.read(len(SIGNATURE))
-    if not signature.startswith(EXR_SIGNATURE) and signature != SIGNATURE:
+    if not signature.startswith(array_files.EXR_SIGNATURE) and signature != SIGNATURE:
         raise UserError(f"{path} is neither an EXR nor a NetCDF-4 file")
-    return signature.startswith(EXR_SIGNATURE)
+    return signature.startswith(array_files.EXR_SIGNATURE)
 
 
 def kinds_of(dataset: xr.Dataset) -> set[str]:

@@ -27,8 +27,7 @@ from mitransient_lidar.results import sum_errors
 from mitransient_lidar.results.attributes import check_attributes, check_coordinates, label, made_from
 from mitransient_lidar.results.geometry import lidar_geometry, optional_number, required_number
 
-#: Dimensions that only results with time bins have.
-_OF_BINS = ("time", "origin", "batch", *sum_errors.DIMS)
+_OF_BINS = ("time", "origin", "batch", *sum_errors.DIMS)  #: Dimensions that only results with time bins have.
 
 _ROUNDING = 1e-6  # fraction of a bin by which rounded times may exceed the record
 
@@ -43,8 +42,7 @@ def train_from_options(
         Option("Depth below the mean sea level at which the first gate opens on the axis [m]", flag="--start-depth"),
     ] = None,
     start_range_m: Annotated[
-        float | None,
-        Option("Distance from the lidar along the axis [m], instead of a time", 0, flag="--start-range"),
+        float | None, Option("Distance from the lidar along the axis [m], instead of a time", 0, flag="--start-range")
     ] = None,
     width_ns: Annotated[float | None, positive_option("Gate width between half heights", "ns")] = None,
     step_ns: Annotated[float | None, positive_option("Time from gate to gate, by default the width", "ns")] = None,
@@ -107,12 +105,7 @@ def gate_depths(train: GateTrain, attributes: Mapping[str, Any]) -> FloatArray:
 
 
 def build_gates(
-    energy: ArrayLike,
-    stderr: ArrayLike,
-    train: GateTrain,
-    *,
-    coords: Mapping[Any, Any],
-    attributes: Mapping[str, Any],
+    energy: ArrayLike, stderr: ArrayLike, train: GateTrain, *, coords: Mapping[Any, Any], attributes: Mapping[str, Any]
 ) -> xr.Dataset:
     """Label the energies in gates, summed over their pulses, and their standard errors [J] as a gate stack.
 

@@ -18,13 +18,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
-from mitransient_lidar.physics.lidar.level_sea import (
-    LidarGeometry,
-    LidarSystem,
-    snell,
-    solid_angle_per_area,
-    surface_time_ns,
-)
+from mitransient_lidar.physics.lidar import level_sea
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.results.attributes import described
@@ -85,11 +79,11 @@ class LinesOfSight:
         if np.any(down <= 0):
             raise UserError("angle_x and angle_y must point below the horizon: the lines of sight must meet the sea")
         off_nadir = np.arccos(np.minimum(down, 1))
-        time = surface_time_ns(axis.height, off_nadir)
+        time = level_sea.surface_time_ns(axis.height, off_nadir)
         measured = optional_number(dataset.attrs, "surface_time_ns")
         if measured is not None:
             time = time + measured - time.mean()
-        water = np.cos(snell(off_nadir, axis.refractive_index))
+        water = np.cos(level_sea.snell(off_nadir, axis.refractive_index))
         unknown = np.full(count, np.nan)
         return cls(x, y, off_nadir, time, np.zeros(count), axis.metres_per_ns * water, unknown)
 
@@ -135,18 +129,20 @@ class LinesOfSight:
         delay = np.asarray(depth, np.float64) / _columns(self.depth_per_ns, size)
         return np.asarray(_columns(self.surface_time, size) + delay)
 
-    def spreading(self, geometry: LidarGeometry, time_ns: FloatArray) -> FloatArray:
+    def spreading(self, geometry: level_sea.LidarGeometry, time_ns: FloatArray) -> FloatArray:
         """Return the aperture's solid angle at times [ns], shape (time,), relative to the surface; 1 above it.
 
         The shape is (pixels, time). The geometry provides the height and the refractive index.
         """
         depth = np.maximum(self.depth_of_time(np.broadcast_to(time_ns, (self.off_nadir.size, time_ns.size))), 0)
         theta = self.off_nadir[:, np.newaxis]
-        at, n = solid_angle_per_area, geometry.refractive_index
+        at, n = level_sea.solid_angle_per_area, geometry.refractive_index
         return np.asarray(at(geometry.height, depth, theta, n) / at(geometry.height, 0.0, theta, n))
 
 
-def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "measured"] = "any") -> LidarGeometry:
+def lidar_geometry(
+    attributes: Attributes, *, surface: Literal["any", "level", "measured"] = "any"
+) -> level_sea.LidarGeometry:
     """Read a lidar's geometry from a result's attributes.
 
     They are ``altitude`` [m], ``off_nadir_deg``, ``refractive_index``, ``group_index`` and, optionally,
@@ -162,10 +158,10 @@ def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "
     height, degrees, refractive_index, group_index = (required_number(attributes, name) for name in names)
     measured = None if surface == "level" else optional_number(attributes, "surface_time_ns")
     time = math.nan if measured is None else measured
-    return LidarGeometry(height, math.radians(degrees), refractive_index, group_index, surface_time_ns=time)
+    return level_sea.LidarGeometry(height, math.radians(degrees), refractive_index, group_index, surface_time_ns=time)
 
 
-def lidar_system(attributes: Attributes, efficiency: float | None = None) -> LidarSystem:
+def lidar_system(attributes: Attributes, efficiency: float | None = None) -> level_sea.LidarSystem:
     """Return the lidar equation's system, with the whole beam's energy and the open aperture area.
 
     The efficiency, 0 to 1, includes transmitter, receiver and two-way atmospheric transmittance; by default it is the
@@ -176,7 +172,7 @@ def lidar_system(attributes: Attributes, efficiency: float | None = None) -> Lid
     geometry = lidar_geometry(attributes)
     blocked = in_range("obscuration", optional_number(attributes, "obscuration") or 0.0, 0, 1)
     area = required_number(attributes, "aperture_area") * (1 - blocked)
-    return LidarSystem(**vars(geometry), energy=energy, aperture_area=area)
+    return level_sea.LidarSystem(**vars(geometry), energy=energy, aperture_area=area)
 
 
 def spot_diameter(attributes: Attributes) -> float:

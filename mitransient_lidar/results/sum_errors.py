@@ -16,8 +16,7 @@ from mitransient_lidar.results.attributes import label
 #: Variable with the correlation between bin errors, and its dimensions.
 VARIABLE, DIMS = "error_correlation", ("error_time", "other_error_time")
 
-#: Most sums of a length, and smallest sum over the largest one, for the curve.
-_SUMS, _FAINT = 256, 1e-6
+_SUMS, _FAINT = 256, 1e-6  #: Most sums of a length, and smallest sum over the largest one, for the curve.
 
 #: Passes below which correlations are hardly known, smallest ratio of means, and samples in memory at a time for them.
 _FEW_PASSES, _LEAST_RATIO, _TOGETHER = 8, 0.1, 2**18

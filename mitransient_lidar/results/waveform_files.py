@@ -19,9 +19,8 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.formats.array_files import readable_suffix
-from mitransient_lidar.core.formats.las_waveforms import las_blocks
 from mitransient_lidar.core.formats.pulse_waves import pulse_blocks
-from mitransient_lidar.core.formats.waveform_blocks import WaveformBlock
+from mitransient_lidar.core.formats.waveform_blocks import WaveformBlock, las_blocks
 from mitransient_lidar.core.validation import finite, integer, require_memory
 from mitransient_lidar.physics.lidar.level_sea import snell, surface_time_ns
 from mitransient_lidar.results.attributes import check_attributes, label, step_of_history

@@ -23,8 +23,7 @@ from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 logger = logging.getLogger(__name__)
 
-#: Smallest distance from a plane to the bottom [m], larger than intersection rounding errors.
-_ABOVE_BOTTOM = 1e-3
+_ABOVE_BOTTOM = 1e-3  #: Smallest distance from a plane to the bottom [m], larger than intersection rounding errors.
 
 #: Number of radii and delays in the distributions, smallest over largest, and largest share of the light beyond them.
 _STEPS, _SMALLEST, _BEYOND = 160, 1e-3, 2e-3
@@ -57,22 +56,13 @@ def beam_spread(
 
     Arguments as of `light_classes.scattering`.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``depth`` [m], increasing: ``transmitted`` and ``unscattered`` (shares of the energy that leaves the
-        laser), ``in_view`` (share of the light at the depth), ``centroid_x``, ``centroid_y``, ``radius_rms``,
-        ``radius_50``, ``radius_90``, ``shift_rms`` [m], ``delay_mean``, ``delay_std`` [ns]. Over ``depth`` and
-        ``radius`` [m] or ``delay`` [ns], the light shares ``within_radius``, ``within_shift`` and ``within_delay``.
-        Each has its standard error over the passes, ``..._stderr``. Without light, all but the first two are NaN.
+    Result: over ``depth`` [m], increasing: ``transmitted`` and ``unscattered`` (shares of the energy that leaves the
+    laser), ``in_view`` (share of the light at the depth), ``centroid_x``, ``centroid_y``, ``radius_rms``,
+    ``radius_50``, ``radius_90``, ``shift_rms`` [m], ``delay_mean``, ``delay_std`` [ns]. Over ``depth`` and ``radius``
+    [m] or ``delay`` [ns], the light shares ``within_radius``, ``within_shift`` and ``within_delay``. Each has its
+    standard error over the passes, ``..._stderr``. Without light, all but the first two are NaN. Raises `UserError` if
+    the scene is invalid or has no water, or a number is out of range.
 
-    Raises
-    ------
-    UserError
-        If the scene is invalid or has no water, or a number is out of range.
-
-    Notes
-    -----
     Light that has not met a solid counts each time that it passes the plane downwards: the result is the downward plane
     irradiance integrated over the plane. Light outside the surface mesh is excluded; its share of the energy is the
     attribute ``beam_outside_surface``.

@@ -15,11 +15,12 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked, positive_option, refuse_unused
@@ -31,9 +32,6 @@ from mitransient_lidar.rendering.render import render
 from mitransient_lidar.transport.paths.passes import PassRenderer
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene_parts import lidar_sensor
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 #: Measurement values: task labels and arguments.
 Tasks = Mapping[tuple[str, ...], Mapping[str, Any]]
@@ -69,16 +67,12 @@ _TARGET = """
     </shape>
 </scene>"""
 
-#: Cases for ``--quick``.
-QUICK_CASES = ("flat", "clear")
+QUICK_CASES = ("flat", "clear")  #: Cases for ``--quick``.
 
 INTEGRATORS = ("lidar_merging", "lidar_volpath")
 
-#: Passes after the first one, which compiles.
-_QUICK_PASSES, _PASSES = 16, 64
-
-#: Longest time of a render to a given error [s].
-_LONGEST_S = 120.0
+_QUICK_PASSES, _PASSES = 16, 64  #: Passes after the first one, which compiles.
+_LONGEST_S = 120.0  #: Longest time of a render to a given error [s].
 
 #: Headings of the figures of integrators and instruments, of images, and of beams.
 _COLUMNS = {
@@ -94,14 +88,10 @@ _COLUMNS = {
     "figure_of_merit": "1/(var s)",
 }
 
-#: Layouts whose cost is measured.
-LAYOUTS = ("2x2", "8x8", "32x32", "128x128", "256x256")
+LAYOUTS = ("2x2", "8x8", "32x32", "128x128", "256x256")  #: Layouts whose cost is measured.
+TARGET_ERROR = 0.1  #: Median relative error over the lit pixels of the gate on the bottom at which a render ends.
 
-#: Median relative error over the lit pixels of the gate on the bottom at which a render ends.
-TARGET_ERROR = 0.1
-
-#: A pixel is lit with this share of the brightest energy (99th percentile).
-_LIT = 0.05
+_LIT = 0.05  #: A pixel is lit with this share of the brightest energy (99th percentile).
 
 _GATES = """<film type="time_gated_film">
             <float name="gate_start_ns" value="1411"/>
@@ -125,16 +115,14 @@ DIVERGENCES = (0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 20.0)
 VIEWS = (2, 5, 10, 20, 50, 100)
 _LARGEST_VIEW = 100.0
 
-#: Reference beam and view [mrad].
-REFERENCE = (10.0, 30.0)
+REFERENCE = (10.0, 30.0)  #: Reference beam and view [mrad].
 
 WATERS = {"clear": {}, "turbid": TURBID}
 SEAS = {"flat": {"spectrum": "flat"}, "waves": {}}
 
 _SCENE, _WIND = "table1", {"wind_speed": "6"}
 
-#: Passes after the first one, which compiles.
-_BEAM_PASSES = 16
+_BEAM_PASSES = 16  #: Passes after the first one, which compiles.
 
 _BEAM_COLUMNS = {"figure_of_merit": "1/(var s)", "ratio": "of 10 in 30", "cpu_s": "CPU s/pass"}
 

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 import numpy as np
 import xarray as xr
 
+from mitransient_lidar.analysis.information.errors import jackknife_error
 from mitransient_lidar.analysis.information.fisher import fisher_information, priors
-from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.receiver import Gain, OpticalDensity, chain_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import (
@@ -35,8 +35,7 @@ from mitransient_lidar.rendering.render import render
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.studies.cases import Cases
 
-#: Most designs in a comparison.
-MOST_DESIGNS = 1000
+MOST_DESIGNS = 1000  #: Most designs in a comparison.
 
 _JOINED = ("bound", "bound_stderr", "bound_known", "variance_share", "monte_carlo_share", "correlation")
 

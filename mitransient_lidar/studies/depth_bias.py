@@ -39,8 +39,7 @@ from mitransient_lidar.studies.cases import Cases
 
 _LOG = logging.getLogger(__name__)
 
-#: Waters by their Jerlov types: clear ocean, coast, and turbid coast.
-WATERS = ("IB", "1C", "5C")
+WATERS = ("IB", "1C", "5C")  #: Waters by their Jerlov types: clear ocean, coast, and turbid coast.
 
 
 def rising(meaning: str, unit: str, **more: Any) -> Option:
@@ -62,20 +61,14 @@ SeaTime = Annotated[
 ]
 SeaSeed = Annotated[int, Option("Random seed", 0, 2**31)]
 
-#: Wavelength in their tables [nm].
-_WAVELENGTH = 532.0
+_WAVELENGTH = 532.0  #: Wavelength in their tables [nm].
 
 #: Relative standard error of renders over a level sea, relative to waves, which differ more between locations.
 _LEVEL = 0.6
 
-#: Difference of the second angle [degree], and angle from which it is less.
-_FURTHER, _GRAZING = 5.0, 60.0
-
-#: Distance from the bottom within which its signal is the largest [m].
-_NEAR = 0.5
-
-#: Signal-to-noise ratio of bright bottoms, and largest error of their depths [m].
-_BRIGHT, _RIGHT = 10.0, 2.0
+_FURTHER, _GRAZING = 5.0, 60.0  #: Difference of the second angle [degree], and angle from which it is less.
+_NEAR = 0.5  #: Distance from the bottom within which its signal is the largest [m].
+_BRIGHT, _RIGHT = 10.0, 2.0  #: Signal-to-noise ratio of bright bottoms, and largest error of their depths [m].
 
 #: Attributes of renders that do not depend on angle, wind, water and depth.
 _GEOMETRY = ("altitude", "divergence_mrad", "refractive_index")
@@ -86,8 +79,7 @@ _NUMBERS = (
     *("corrected_bias", "corrected_spread", "corrected_z", "snr"),
 )
 
-#: Numbers for bottoms that are not found.
-_ZERO = ("found", "flagged", "wrong")
+_ZERO = ("found", "flagged", "wrong")  #: Numbers for bottoms that are not found.
 
 
 @checked
@@ -109,8 +101,7 @@ def depth_bias(
     shots: Places = 12,
     records: Records = 5,
     target_error: Annotated[
-        float,
-        Option("Relative standard error of a render over waves; 0.6 of it over a level sea", 0, 1, above=True),
+        float, Option("Relative standard error of a render over waves; 0.6 of it over a level sea", 0, 1, above=True)
     ] = 0.05,
     corrections: Annotated[
         Given | None,
@@ -363,8 +354,7 @@ Pointing = Annotated[float, Option("Standard deviation of the beam direction, ea
 PositionError = Annotated[float, Option("Standard deviation of the horizontal position, each axis", 0)]
 HeightError = Annotated[float, Option("Standard deviation of the sea surface height", 0)]
 
-#: Wind whose ripples a level sea has [m/s].
-RIPPLES = 5.0
+RIPPLES = 5.0  #: Wind whose ripples a level sea has [m/s].
 
 #: Winds [m/s] and waters in the tables for uncertainty tools, and depths at which airborne lidars find the bottom.
 _SURVEY_WINDS, _SURVEY_DEPTHS = (1.0, 3.0, 5.0, 7.0, 9.0), (1.0, 1.5, 3.0, 6.0, 10.0)

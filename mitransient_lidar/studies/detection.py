@@ -91,8 +91,7 @@ def detect(
     background_power_w: BackgroundPower = 0.0,
     frames: Annotated[int, Option("Averaged camera frames per gate, of one sea", 1, 1_000_000)] = 1,
     passes: Annotated[
-        int | None,
-        Option("Number of independent passes per render, by default 16, without a receiver 64", 16, 100_000),
+        int | None, Option("Number of independent passes per render, by default 16, without a receiver 64", 16, 100_000)
     ] = None,
     max_time: Annotated[
         float | None,

@@ -15,13 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.information.alignment import (
-    BANDWIDTH,
-    BANDWIDTH_BOUNDS,
-    BANDWIDTH_START,
-    behind_bandwidth,
-)
-from mitransient_lidar.analysis.information.cramer_rao import SCALE, TIME_OFFSET
+from mitransient_lidar.analysis.information import alignment
+from mitransient_lidar.analysis.information.alignment import BANDWIDTH
+from mitransient_lidar.analysis.information.fisher import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.fits import Model, WaveformFit
 from mitransient_lidar.analysis.information.measured import measured, with_waveforms
 from mitransient_lidar.core.errors import UserError
@@ -57,8 +53,7 @@ _LARGEST_RATIO = 0.1  # variance by the model's Monte Carlo over the waveform va
 def fit(
     source: xr.Dataset | str | os.PathLike[str],
     scene: Annotated[
-        str | os.PathLike[str] | Model | None,
-        Option("Name or XML file of the scene, by default the result's scene"),
+        str | os.PathLike[str] | Model | None, Option("Name or XML file of the scene, by default the result's scene")
     ] = None,
     free: Annotated[
         Sequence[str], Option("Free scene parameters, and bandwidth_mhz for a receiver", form="NAME,NAME,...")
@@ -73,8 +68,7 @@ def fit(
         Mapping[str, tuple[float, float]] | None, Option("Bounds of a free parameter. Repeatable", form="NAME=LOW:HIGH")
     ] = None,
     free_scale: Annotated[
-        bool | None,
-        Option("Fit a scale factor, by default for CSV files alone", flag="--free-scale/--fixed-scale"),
+        bool | None, Option("Fit a scale factor, by default for CSV files alone", flag="--free-scale/--fixed-scale")
     ] = None,
     free_time: Annotated[
         bool | None, Option("Fit a time offset, by default for CSV files alone", flag="--free-time/--fixed-time")
@@ -150,8 +144,8 @@ def fit(
     if BANDWIDTH in names:
         if found.receiver is not None:
             raise UserError(f"free = {BANDWIDTH} and a receiver, which has its own response, are alternatives")
-        start = {BANDWIDTH: BANDWIDTH_START, **(start or {})}
-        bounds = {BANDWIDTH: BANDWIDTH_BOUNDS, **(bounds or {})}
+        start = {BANDWIDTH: alignment.BANDWIDTH_START, **(start or {})}
+        bounds = {BANDWIDTH: alignment.BANDWIDTH_BOUNDS, **(bounds or {})}
     model = None
     if callable(scene):
         if missing := [name for name in names if name not in (start or {})]:
@@ -174,7 +168,7 @@ def fit(
         bounds = {**model.bounds(), **(bounds or {})}
 
     def light() -> Model:
-        return behind_bandwidth(render_at) if BANDWIDTH in names else render_at
+        return alignment.behind_bandwidth(render_at) if BANDWIDTH in names else render_at
 
     problem = WaveformFit(found, light(), starts, bounds, free_scale=free_scale, free_time=free_time)
     problem.approach(most_renders=most_renders, until=began + limit)

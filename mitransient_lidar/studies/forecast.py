@@ -23,12 +23,7 @@ from mitransient_lidar.analysis.depth_uncertainty import (
     sounding_uncertainty,
 )
 from mitransient_lidar.analysis.receiver import SATURATING, detect_waveforms, receiver_of_result, shared_settings
-from mitransient_lidar.analysis.waveforms.depth_correction import (
-    AXES,
-    correct_depths,
-    corrections_for,
-    summarize_depths,
-)
+from mitransient_lidar.analysis.waveforms import depth_correction
 from mitransient_lidar.analysis.waveforms.echo_detection import has_echo
 from mitransient_lidar.analysis.waveforms.echo_table import extract
 from mitransient_lidar.core.errors import UserError
@@ -46,25 +41,13 @@ from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.batches import ShotPoses
-from mitransient_lidar.rendering.shots.pilots import PILOTS, pilots_over, rendered
-from mitransient_lidar.rendering.shots.scene import ShotScene
+from mitransient_lidar.rendering.shots.scene import PILOTS, ShotScene, pilots_over, rendered
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.rendering.shots.truth import sea_of, truth_coordinates
 from mitransient_lidar.results.attributes import label, uninterrupted
 from mitransient_lidar.results.files import Given
+from mitransient_lidar.studies import depth_bias
 from mitransient_lidar.studies.cases import Cases
-from mitransient_lidar.studies.depth_bias import (
-    HeightError,
-    InstrumentName,
-    OwnReceiver,
-    Places,
-    Pointing,
-    PositionError,
-    Records,
-    SeaScene,
-    SeaSeed,
-    rms_slopes,
-)
 from mitransient_lidar.transport.light_maps.suitability import reach_of_scattering
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
@@ -80,8 +63,7 @@ _RIGHT, _NONE, _ALL = 1.0, 0.05, 0.98
 #: Farthest place on the sea from its origin along x and y [m]; estimator of depths, as that of flights.
 _FARTHEST, _ESTIMATOR = 200.0, "gaussian"
 
-#: Wavelength of waters by name, which is that of the table of any green instrument [nm].
-_WAVELENGTH = 532.0
+_WAVELENGTH = 532.0  #: Wavelength of waters by name, which is that of the table of any green instrument [nm].
 
 #: Passes of light maps, as in flights, relative standard error of renders below their reach, and depths of a range.
 _PASSES, _ERROR, _IN_RANGE = 2, 0.05, 200
@@ -144,7 +126,7 @@ class _Site:
 @checked
 @alone
 def forecast(
-    instrument: InstrumentName,
+    instrument: depth_bias.InstrumentName,
     site: Annotated[
         str | os.PathLike[str],
         Option(
@@ -158,17 +140,17 @@ def forecast(
     ] = None,
     kd: Annotated[Any, Option("Diffuse attenuation, or a GeoTIFF of it", unit="1/m", form="NUMBER|FILE")] = None,
     values: Annotated[str | None, Option("Whether the map has heights or depths, by default as it states")] = None,
-    scene: SeaScene = "table1",
-    receiver: OwnReceiver = None,
+    scene: depth_bias.SeaScene = "table1",
+    receiver: depth_bias.OwnReceiver = None,
     corrections: Annotated[
         Given | None, Option("Table from depth-bias that corrects the depths, auto for the shipped one", form="FILE")
     ] = None,
-    shots: Places = 24,
-    records: Records = 2,
-    pointing_mrad: Pointing = 0.1,
-    position_m: PositionError = 0.05,
-    height_m: HeightError = 0.05,
-    seed: SeaSeed = 1,
+    shots: depth_bias.Places = 24,
+    records: depth_bias.Records = 2,
+    pointing_mrad: depth_bias.Pointing = 0.1,
+    position_m: depth_bias.PositionError = 0.05,
+    height_m: depth_bias.HeightError = 0.05,
+    seed: depth_bias.SeaSeed = 1,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Forecast where an instrument finds the bottom of a site, how well, and down to which depth.
@@ -231,7 +213,7 @@ def forecast(
     if not deep.any():
         raise UserError(f"{name} = {given!r} must cover cells of the site that are deeper than {_SHALLOWEST} m")
     waters = _nodes(float(water[deep].min()), float(water[deep].max()), _WATERS)
-    table = None if corrections is None else corrections_for(instrument, corrections)
+    table = None if corrections is None else depth_correction.corrections_for(instrument, corrections)
     tables: list[xr.Dataset] = []
     cases = Cases(waters.tolist(), "waters", unit="water", progress=progress)
     for one in cases:
@@ -432,7 +414,7 @@ class _Bottoms:
         """Return a table as of `depth_bias.depth_bias`."""
         data: dict[str, Any] = {}
         for name, value in next(iter(cells.values())).items():
-            dims = (*AXES, "estimator", "pixel") if np.ndim(value) else AXES
+            dims = (*depth_correction.AXES, "estimator", "pixel") if np.ndim(value) else depth_correction.AXES
             data[name] = dims, np.array([cell[name] for cell in cells.values()])[np.newaxis, np.newaxis, np.newaxis]
         wind = float(self._attributes.get("scene.wind_speed") or 0)
         numbers = {"off_nadir_deg": float(self._attributes["off_nadir_deg"]), "wind_speed": wind}
@@ -446,12 +428,12 @@ def _numbers(recorded: xr.Dataset, corrections: xr.Dataset | None) -> dict[str, 
     truth = recorded["true_bottom_depth_below_surface"].values
     echoes = extract(recorded, [_ESTIMATOR], targets=1)
     if corrections is not None:
-        echoes = correct_depths(echoes, corrections)
-    numbers: dict[str, Any] = dict(summarize_depths(echoes, truth))
+        echoes = depth_correction.correct_depths(echoes, corrections)
+    numbers: dict[str, Any] = dict(depth_correction.summarize_depths(echoes, truth))
     bottom = echoes.sel(echo="bottom").transpose("shot", "pixel", "estimator")
     right = np.abs(bottom["depth_m"].values - truth[:, np.newaxis, np.newaxis]) < _RIGHT
     numbers["found"] = np.mean(right & has_echo(bottom["flags"].values), axis=0).T
-    return numbers | rms_slopes(recorded)
+    return numbers | depth_bias.rms_slopes(recorded)
 
 
 def _found(cell: Mapping[str, Any]) -> float:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.jackknife import jackknife_error
+from mitransient_lidar.analysis.information.errors import jackknife_error
 from mitransient_lidar.analysis.retrieval.column_retrieval import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import (
@@ -58,8 +58,7 @@ def scattering(
     params: Mapping[str, Any] | None = None,
     *,
     orders: Annotated[
-        int | None,
-        Option("Scattering orders to separate, 8 unless depths or views are given", 1, MOST_ORDERS),
+        int | None, Option("Scattering orders to separate, 8 unless depths or views are given", 1, MOST_ORDERS)
     ] = None,
     depths: Annotated[
         Numbers | None,
@@ -146,19 +145,11 @@ def scattering_orders(
     reversed at least once, and three times or more by scattering, a second reflection, or reflection inside the
     surface. Arguments as of `scattering`.
 
-    Returns
-    -------
-    xarray.Dataset
-        ``impulse_response`` [J per bin] and ``waveform`` [W] with their standard errors, over ``pixel``, ``reversals``
-        (``one``, ``several``), ``order`` (the last includes all higher ones) and ``time`` [ns]; their sums over
-        ``reversals`` and ``order`` equal `rendering.render.render`. ``energy`` [J] over all pixels and times and its
-        standard error, over ``reversals`` and ``order``. After Ctrl-C it includes the completed passes, and the
-        attribute ``interrupted`` is 1.
-
-    Raises
-    ------
-    UserError
-        If the scene or a parameter is invalid or out of range.
+    Result: ``impulse_response`` [J per bin] and ``waveform`` [W] with their standard errors, over ``pixel``,
+    ``reversals`` (``one``, ``several``), ``order`` (the last includes all higher ones) and ``time`` [ns]; their sums
+    over ``reversals`` and ``order`` equal `rendering.render.render`. ``energy`` [J] over all pixels and times and its
+    standard error, over ``reversals`` and ``order``. After Ctrl-C it includes the completed passes, and the attribute
+    ``interrupted`` is 1. Raises `UserError` if the scene or a parameter is invalid or out of range.
     """
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor, classes=PathClasses(orders))
@@ -234,25 +225,15 @@ def fov_sweep(
     ``field_of_view_mrad``, which determines the size of the surface. `fields` are full angles [mrad], increasing; the
     fit's two `limits` [m] lie in homogeneous water and far from bottom and targets.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``field_of_view`` [mrad], increasing: ``effective_attenuation`` K and its standard error
-        ``effective_attenuation_stderr`` [1/m], ``spot_radius`` R_s [m] of the circle that the receiver sees across the
-        axis where that meets the mean surface, ``scaled_radius`` c R_s [1], ``system_attenuation`` [1/m] by the fit in
-        `system_attenuation`. Over ``field_of_view`` and ``time`` [ns]: ``impulse_response`` [J per bin] and its
-        standard error. Attributes: ``attenuation`` c, ``absorption`` a, ``a_plus_bb``, ``kd`` [1/m] of the water,
-        ``beam_radius`` R_b [m], and ``left_out_mrad``, as text the fields of view that time or Ctrl-C has left
-        out.
+    Result: over ``field_of_view`` [mrad], increasing: ``effective_attenuation`` K and its standard error
+    ``effective_attenuation_stderr`` [1/m], ``spot_radius`` R_s [m] of the circle that the receiver sees across the axis
+    where that meets the mean surface, ``scaled_radius`` c R_s [1], ``system_attenuation`` [1/m] by the fit in
+    `system_attenuation`. Over ``field_of_view`` and ``time`` [ns]: ``impulse_response`` [J per bin] and its standard
+    error. Attributes: ``attenuation`` c, ``absorption`` a, ``a_plus_bb``, ``kd`` [1/m] of the water, ``beam_radius``
+    R_b [m], and ``left_out_mrad``, as text the fields of view that time or Ctrl-C has left out. Raises `UserError` if
+    the scene is invalid, has no water, bubbles, or several layers between the depths, a solid's echo can overlap with
+    them, a number is out of range, or as for `ColumnBins`.
 
-    Raises
-    ------
-    UserError
-        If the scene is invalid, has no water, bubbles, or several layers between the depths, a solid's echo can overlap
-        with them, a number is out of range, or as for `ColumnBins`.
-
-    Notes
-    -----
     Gordon (1982), Appl. Opt. 21, 2996, doi:10.1364/AO.21.002996: for a narrow beam, K is c for c R_s far below 1, and
     falls to the diffuse attenuation at c R_s above 5 to 6. The signal depends on the correlation between the profiles
     of beam and field of view, so that both widths have the same effect. R = sqrt(R_s^2 + R_b^2) is the radius of a disc

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction
+from mitransient_lidar.analysis.retrieval.surface_slope import SlopeRefraction
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, Scene, checked, positive_option
 from mitransient_lidar.core.tables.written import table_lines
@@ -27,11 +27,7 @@ from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.geometry import lidar_geometry
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
-if TYPE_CHECKING:
-    import xarray as xr
-
-#: Largest number of pixels whose footprints are mapped.
-_MOST_MAPPED_PIXELS = 64
+_MOST_MAPPED_PIXELS = 64  #: Largest number of pixels whose footprints are mapped.
 
 _PASSES = 12
 
@@ -151,8 +147,7 @@ def _pixel_map(receiver: Receiver) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     return lines, np.where(np.array(held) > 0, np.array(index).astype(int), -1).reshape(x.shape)
 
 
-#: Half width of the gates about the echoes from a level sea [ns].
-_HALF_GATE_NS = 10.0
+_HALF_GATE_NS = 10.0  #: Half width of the gates about the echoes from a level sea [ns].
 
 
 def shot_statistics(series: xr.Dataset) -> xr.Dataset:
@@ -162,13 +157,10 @@ def shot_statistics(series: xr.Dataset) -> xr.Dataset:
 
     `series`: a result of `rendering.shots.series.render_shots` for a scene with the parameter ``bottom_depth``.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``shot``: ``aim_x``, ``aim_y`` [m], ``slope_along``, ``slope_across`` (mean over the beam's footprint,
-        positive along for a face towards the lidar, [1]). Over ``shot`` and ``pixel``: ``surface_peak``,
-        ``bottom_peak`` [W], ``surface_time``, ``bottom_time`` [ns] at the waveform's highest point in a 20 ns gate
-        about the echo from a level sea; NaN where it lies at a gate limit.
+    Result: over ``shot``: ``aim_x``, ``aim_y`` [m], ``slope_along``, ``slope_across`` (mean over the beam's footprint,
+    positive along for a face towards the lidar, [1]). Over ``shot`` and ``pixel``: ``surface_peak``, ``bottom_peak``
+    [W], ``surface_time``, ``bottom_time`` [ns] at the waveform's highest point in a 20 ns gate about the echo from a
+    level sea; NaN where it lies at a gate limit.
     """
     columns: dict[str, FloatArray] = {name: series[name].values for name in ("aim_x", "aim_y")}
     columns |= {f"slope_{name}": series[f"true_slope_{name}"].values for name in ("along", "across")}

@@ -27,11 +27,9 @@ from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.transport.paths.passes import LidarIntegrator, PassRenderer
 from mitransient_lidar.transport.solids import shape_groups
 
-#: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
-_HALF_GATE = 1.0
+_HALF_GATE = 1.0  #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
 
-#: Jackknife pass groups.
-_GROUPS = 16
+_GROUPS = 16  #: Jackknife pass groups.
 
 
 def target_signal(
@@ -55,24 +53,15 @@ def target_signal(
     `passes`: independent passes per render, at least 16. `axis`: time bins instead of automatic ones. `is_lit`: whether
     a target that returns no light is refused. Others as of `detection.detect`.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``pixel`` and ``time`` [ns]: ``waveform`` (with the target), ``background`` (without) and ``difference``
-        [W]. Over ``pixel``, in a gate of two pulse widths about the peak of the summed difference: ``echo`` and
-        ``backscatter`` [J] in difference and background, their ratio ``contrast``, ``shadow`` [J] (negative part of the
-        difference after the gate), ``detectability`` and the best ``weight``. Over ``combination`` (``sum`` over all
-        pixels, ``best``: their weighted sum): ``combined_echo``, ``combined_contrast`` and ``combined_detectability``.
-        All with standard errors (for the gates: jackknife over 16 pass groups).
+    Result: over ``pixel`` and ``time`` [ns]: ``waveform`` (with the target), ``background`` (without) and
+    ``difference`` [W]. Over ``pixel``, in a gate of two pulse widths about the peak of the summed difference: ``echo``
+    and ``backscatter`` [J] in difference and background, their ratio ``contrast``, ``shadow`` [J] (negative part of the
+    difference after the gate), ``detectability`` and the best ``weight``. Over ``combination`` (``sum`` over all
+    pixels, ``best``: their weighted sum): ``combined_echo``, ``combined_contrast`` and ``combined_detectability``. All
+    with standard errors (for the gates: jackknife over 16 pass groups). Raises `UserError` if the scene or a parameter
+    is invalid, there is no such shape, or it is above the sea or below the bottom. With `is_lit`, if the sum of the
+    pixels' echoes is not positive: it returns no light, or too little for these passes.
 
-    Raises
-    ------
-    UserError
-        If the scene or a parameter is invalid, there is no such shape, or it is above the sea or below the bottom. With
-        `is_lit`, if the sum of the pixels' echoes is not positive: it returns no light, or too little for these passes.
-
-    Notes
-    -----
     Where backscatter limits detection, a pixel's noise variance is proportional to the backscatter energy B. With
     echoes E and weights w, the signal-to-noise ratio is proportional to the ``detectability`` sum(w E) / sqrt(sum(w^2
     B)) [sqrt(J)], which is largest for w = E/B (matched filter): sqrt(sum(E^2/B)). Ratios of detectabilities are ratios

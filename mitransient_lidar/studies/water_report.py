@@ -20,8 +20,7 @@ PhaseFunction = Callable[[ArrayLike], FloatArray]
 
 REPORTED_KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "profile", "pure")
 
-#: Default ``profile_tolerance`` of the medium ``layered_water``.
-DEFAULT_TOLERANCE = 0.01
+DEFAULT_TOLERANCE = 0.01  #: Default ``profile_tolerance`` of the medium ``layered_water``.
 
 #: Uncertainty of each kind's properties.
 _CAUTION = {

@@ -23,17 +23,10 @@ _SAME, _APART, _ROUNDING = 2e-5, 1e-4, 2.0**-20
 #: Least cosine between normals of faces that coincide, and least number of rays that find them.
 _PARALLEL, _LEAST_RAYS = 0.9999, 3
 
-#: Largest vertical component of a direction that counts as level.
-_LEVEL = 1e-3
-
-#: Rays along each box side, and boxes whose rays are traced at once.
-_TICKS, _PAIRS_AT_ONCE = 32, 256
-
-#: Largest size of a shape that lies on another one, relative to the other one.
-_SMALLER = 0.99
-
-#: Largest number of shapes that lie on each other.
-_MOST_IN_A_STACK = 64
+_LEVEL = 1e-3  #: Largest vertical component of a direction that counts as level.
+_TICKS, _PAIRS_AT_ONCE = 32, 256  #: Rays along each box side, and boxes whose rays are traced at once.
+_SMALLER = 0.99  #: Largest size of a shape that lies on another one, relative to the other one.
+_MOST_IN_A_STACK = 64  #: Largest number of shapes that lie on each other.
 
 
 @dataclass(frozen=True)

@@ -24,14 +24,12 @@ from mitransient_lidar.transport.scene import WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.solids import box_of
 
-#: Share of beam or view rays that the sea must reflect totally for the record to end there.
-_REFLECTED = 0.1
+_REFLECTED = 0.1  #: Share of beam or view rays that the sea must reflect totally for the record to end there.
 
 #: Least time of a fitted record before the first and after the last light [ns], and more after it in response times.
 _MARGIN_NS, _RESPONSE_TIMES = 12.0, 12.0
 
-#: Smallest record range for a lidar under water with laser and receiver at one location [m].
-NEAREST_RANGE = 0.05
+NEAREST_RANGE = 0.05  #: Smallest record range for a lidar under water with laser and receiver at one location [m].
 
 #: Bins before the surface echo in which its detection measures the noise, and the longest extension for them [ns].
 _QUIET_BINS, _LONGEST_NS = 10, 100.0

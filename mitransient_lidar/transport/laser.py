@@ -21,11 +21,8 @@ from mitransient_lidar.transport.sensor.receiver import Octaves, Receiver
 #: Shares of the peak irradiance at which a beam's outlines are drawn.
 OUTLINE_LEVELS = (float(np.exp(-0.5)), float(np.exp(-2)))
 
-#: Longest image side: 32-bit random numbers do not resolve finer cells.
-_LONGEST_SIDE = 2048
-
-#: Image outlines that enclose less than this share of the largest one are dropped as noise.
-_SMALLEST_ISLAND = 0.02
+_LONGEST_SIDE = 2048  #: Longest image side: 32-bit random numbers do not resolve finer cells.
+_SMALLEST_ISLAND = 0.02  #: Image outlines that enclose less than this share of the largest one are dropped as noise.
 
 
 class BeamProfile(ABC):
@@ -210,14 +207,9 @@ class ImageBeam(BeamProfile):
         return found
 
 
-#: The field of view is sampled separately when it contains less than this share of the beam.
-_SMALLEST_SHARE = 0.5
-
-#: Core radius of the sampled region relative to the field of view, as light around it scatters into it.
-_ROOM = 1.5
-
-#: Width around that core beyond which there is little light, over the beam's standard deviation.
-_BEAM_EDGE = 3.0
+_SMALLEST_SHARE = 0.5  #: The field of view is sampled separately when it contains less than this share of the beam.
+_ROOM = 1.5  #: Core radius of the sampled region relative to the field of view, as light around it scatters into it.
+_BEAM_EDGE = 3.0  #: Width around that core beyond which there is little light, over the beam's standard deviation.
 
 
 class BeamSampler:

@@ -23,8 +23,7 @@ from mitransient_lidar.transport.laser import BeamProfile, GaussianBeam
 from mitransient_lidar.transport.medium.tabulated_phase import half_angle
 from mitransient_lidar.transport.opaque import aligned, opaque
 
-#: Smallest vertical component of segments that are divided among layers: others lie in one.
-_SMALLEST_SLOPE = 1e-9
+_SMALLEST_SLOPE = 1e-9  #: Smallest vertical component of segments that are divided among layers: others lie in one.
 
 #: Sum of each perturbation along a path, empty without perturbations.
 Sums = list[Any]

@@ -77,8 +77,7 @@ class SkyEmitter(Daylight, Protocol):
     distribution: str
     sun: FloatArray
     irradiance: float
-    #: Radiance in a direction [W m^-2 sr^-1 nm^-1].
-    radiance: Callable[[mi.Vector3f], mi.Float]
+    radiance: Callable[[mi.Vector3f], mi.Float]  #: Radiance in a direction [W m^-2 sr^-1 nm^-1].
 
 
 @runtime_checkable

@@ -14,8 +14,7 @@ from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_vector
 from mitransient_lidar.transport.rng import Lanes
 
-#: Smallest sum of two distances [m], against division by zero.
-_SMALLEST_DISTANCE = 1e-12
+_SMALLEST_DISTANCE = 1e-12  #: Smallest sum of two distances [m], against division by zero.
 
 
 @dataclass(frozen=True)

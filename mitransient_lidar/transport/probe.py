@@ -23,11 +23,8 @@ from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.solids import box_of, met_numbers, scene_of_shapes
 
-#: Displacement of rays that pass between faces [m].
-_ASIDE = (1e-4, 0.7e-4, 0.0)
-
-#: Rays in a view and in a beam; Gaussian beam rays reach 4.2 standard deviations.
-PROBE_RAYS = 4096
+_ASIDE = (1e-4, 0.7e-4, 0.0)  #: Displacement of rays that pass between faces [m].
+PROBE_RAYS = 4096  #: Rays in a view and in a beam; Gaussian beam rays reach 4.2 standard deviations.
 
 #: Distance outside view or beam within which waves and scattering still light a shape, over its depth.
 _REACH_PER_DEPTH = 0.3
@@ -35,8 +32,7 @@ _REACH_PER_DEPTH = 0.3
 #: Number of rays that find echoes, and share of the beam excluded at either end of an echo.
 _ECHO_RAYS, _TAIL = 2**16, 0.05
 
-#: Rays for each pixel of a shot that find land.
-_LAND_RAYS = 256
+_LAND_RAYS = 256  #: Rays for each pixel of a shot that find land.
 
 #: Largest number of pixels; with more, each would get too few rays, and the receiver is treated as one pixel.
 _MOST_PIXELS = 1024
@@ -255,12 +251,8 @@ def land_of_shots(scene: LidarScene, shots: int) -> tuple[FloatArray, BoolArray]
 
     The scene is in parts, as a number of shots meet it.
 
-    Returns
-    -------
-    dry_ns
-        Earliest and latest arrival [ns], shape (shots x pixels, 2); NaN without one.
-    alone
-        Whether all that a pixel sees of the beam are solids in the air, shape (shots x pixels,).
+    Returns `dry_ns`: earliest and latest arrival [ns], shape (shots x pixels, 2); NaN without one. `alone`: whether all
+    that a pixel sees of the beam are solids in the air, shape (shots x pixels,).
     """
     pixels = scene.receiver.pixels
     count, slots = int(np.clip(_LAND_RAYS * pixels.count, _LAND_RAYS, PROBE_RAYS)), shots * pixels.count

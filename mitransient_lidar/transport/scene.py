@@ -28,18 +28,12 @@ from mitransient_lidar.transport.solids import box_of, children, scene_of_shapes
 #: Height above all shapes from which paths start there instead of at the lidar, and height of these points [m].
 _FAR, _CLEARANCE = 1e4, 1.0
 
-#: Largest intersection rounding error over the coordinates.
-_ROUNDING = 2.0**-21
-
-#: Length over which slopes change, over the shortest wavelength.
-_FACET_PER_WAVE = 0.25
-
-#: Smallest bottom side over the largest solid's side.
-_BOTTOM_PER_LARGEST = 0.25
+_ROUNDING = 2.0**-21  #: Largest intersection rounding error over the coordinates.
+_FACET_PER_WAVE = 0.25  #: Length over which slopes change, over the shortest wavelength.
+_BOTTOM_PER_LARGEST = 0.25  #: Smallest bottom side over the largest solid's side.
 
 
-#: Smallest cosine from the vertical of an axis under water that has depths.
-_LEVEL = 1e-3
+_LEVEL = 1e-3  #: Smallest cosine from the vertical of an axis under water that has depths.
 
 Vector = TypeVar("Vector", mi.Vector3f, mi.Point3f, mi.Normal3f)
 

@@ -16,19 +16,11 @@ from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.sea_mesh import Footprint
+from mitransient_lidar.transport import plugin_types
 from mitransient_lidar.transport.contacts import separate_contacts
 from mitransient_lidar.transport.fitted_axis import fitted_axis
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import opaque_point
-from mitransient_lidar.transport.plugin_types import (
-    Daylight,
-    GatedFilm,
-    LidarSensor,
-    SeabedShape,
-    SeaShape,
-    Transmitter,
-    WaterMedium,
-)
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
@@ -36,20 +28,14 @@ from mitransient_lidar.transport.solids import bottom_depths, children, shape_gr
 
 logger = logging.getLogger(__name__)
 
-#: Largest number of instances without a warning about the time that they need.
-_MANY_INSTANCES = 20
+_MANY_INSTANCES = 20  #: Largest number of instances without a warning about the time that they need.
 
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
 
-#: Wavelength difference that changes no water [nm].
-_SAME_NM = 1.0
-
-#: Relative refractive index difference that does not matter, more than the index of air.
-_SAME_INDEX = 1e-3
-
-#: Vertical component of an axis under water above which it looks up.
-_SMALLEST_RISE = 0.1
+_SAME_NM = 1.0  #: Wavelength difference that changes no water [nm].
+_SAME_INDEX = 1e-3  #: Relative refractive index difference that does not matter, more than the index of air.
+_SMALLEST_RISE = 0.1  #: Vertical component of an axis under water above which it looks up.
 
 
 def find_lidar_scene(
@@ -69,10 +55,10 @@ def find_lidar_scene(
     fit_seas(scene)
     receiver = receiver or find_receiver(sensor)
     film = sensor.film()
-    if not isinstance(film, GatedFilm):
+    if not isinstance(film, plugin_types.GatedFilm):
         raise UserError("film: the lidar integrators need a time_gated_film inside the sensor")
-    emitters = [emitter for emitter in scene.emitters() if not isinstance(emitter, Daylight)]
-    transmitters = [emitter for emitter in emitters if isinstance(emitter, Transmitter)]
+    emitters = [emitter for emitter in scene.emitters() if not isinstance(emitter, plugin_types.Daylight)]
+    transmitters = [emitter for emitter in emitters if isinstance(emitter, plugin_types.Transmitter)]
     if len(transmitters) != 1 or len(emitters) != 1:
         raise UserError(
             f"emitters: the scene has {len(emitters)} of which {len(transmitters)} are lidar_transmitter; "
@@ -98,7 +84,7 @@ def lidar_sensor(scene: mi.Scene, wanted: str = "") -> mi.Sensor:
     Raises UserError if the scene has none, or none with that id.
     """
     sensors = scene.sensors()
-    receivers = [sensor for sensor in sensors if isinstance(sensor, LidarSensor)]
+    receivers = [sensor for sensor in sensors if isinstance(sensor, plugin_types.LidarSensor)]
     if not receivers:
         found = f"has only {', '.join(sensor.class_name() for sensor in sensors)}" if sensors else "has none"
         raise UserError(f"sensor: the scene {found}; add a multipixel_receiver or pixel_fov")
@@ -114,7 +100,7 @@ def lidar_sensor(scene: mi.Scene, wanted: str = "") -> mi.Sensor:
 
 def find_receiver(sensor: mi.Sensor) -> Receiver:
     """Return the receiver of a sensor plugin; raise UserError when the sensor has none."""
-    if not isinstance(sensor, LidarSensor):
+    if not isinstance(sensor, plugin_types.LidarSensor):
         raise UserError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
     return sensor.receiver
 
@@ -130,7 +116,7 @@ def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
         return
     footprints = []
     for emitter in (model or scene).emitters():
-        if not isinstance(emitter, Transmitter):
+        if not isinstance(emitter, plugin_types.Transmitter):
             continue
         if place := _seen_sea(emitter.pose):
             spreads = emitter.angular_spread, emitter.widest_angular_spread
@@ -138,7 +124,7 @@ def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
         else:
             footprints.append(_without_sea(emitter.pose))
     for sensor in (model or scene).sensors():
-        if isinstance(sensor, LidarSensor) and (place := _seen_sea(sensor.receiver.pose)):
+        if isinstance(sensor, plugin_types.LidarSensor) and (place := _seen_sea(sensor.receiver.pose)):
             pixels = sensor.receiver.pixels
             side = float(np.sqrt(pixels.area / pixels.count))
             footprints.append(Footprint.receiver(*place, pixels.field_of_view, side))
@@ -170,9 +156,9 @@ def _without_sea(pose: KernelPose) -> Footprint:
     return Footprint(place, abs(float(pose.origin[2])), 0.0, True, 0.0, np.inf)
 
 
-def seas_of(scene: mi.Scene) -> list[SeaShape]:
+def seas_of(scene: mi.Scene) -> list[plugin_types.SeaShape]:
     """Return a scene's ``ocean_surface`` shapes."""
-    return [shape for shape in scene.shapes() if isinstance(shape, SeaShape)]
+    return [shape for shape in scene.shapes() if isinstance(shape, plugin_types.SeaShape)]
 
 
 def find_solids(scene: mi.Scene, receiver: Receiver) -> WaterScene:
@@ -229,7 +215,7 @@ def _check_bsdf(shape: mi.Shape) -> bool:
 
     Return whether it has an attribute of vertices whose values may differ.
     """
-    interpolates, is_even = False, isinstance(shape, SeabedShape) and shape.uniform_reflectance is not None
+    interpolates, is_even = False, isinstance(shape, plugin_types.SeabedShape) and shape.uniform_reflectance is not None
     bsdf, point = shape.bsdf(), dr.zeros(mi.SurfaceInteraction3f)
     up = point.wi = mi.Vector3f(0, 0, 1)
     try:
@@ -267,21 +253,23 @@ def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
         if shape.exterior_medium() is not None:
             raise UserError(f"shape {shape.id()!r}: the water must be its interior medium and its exterior empty")
         medium = shape.interior_medium()
-        if not isinstance(medium, WaterMedium):
+        if not isinstance(medium, plugin_types.WaterMedium):
             raise UserError(f"shape {shape.id()!r}: its interior medium must be layered_water")
         surfaces.append(shape)
         if not any(medium.water is other for other in waters):
             waters.append(medium.water)
     for shape in solids_of(scene, surfaces):
         name = shape.id()
-        if isinstance(shape, SeaShape):
+        if isinstance(shape, plugin_types.SeaShape):
             raise UserError(f"ocean_surface {name!r}: needs a layered_water as its interior medium")
     if len(waters) > 1:
         raise UserError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
     for water in waters:
         _check_index(surfaces, water)
         _check_layers(scene, surfaces, water)
-    variances = [sea.sea.slope_variance for sea in surfaces if isinstance(sea, SeaShape) and sea.has_ripples]
+    variances = [
+        sea.sea.slope_variance for sea in surfaces if isinstance(sea, plugin_types.SeaShape) and sea.has_ripples
+    ]
     return (waters[0] if waters else None), surfaces, float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
 
 
@@ -301,7 +289,7 @@ def _check_index(surfaces: list[mi.Shape], water: Water) -> None:
                 )
 
 
-def _check_wavelength(water: Water | None, transmitter: Transmitter) -> None:
+def _check_wavelength(water: Water | None, transmitter: plugin_types.Transmitter) -> None:
     """Refuse a water at another wavelength than the laser's."""
     laser = transmitter.wavelength_nm
     if water is None or water.wavelength_nm is None or abs(water.wavelength_nm - laser) <= _SAME_NM:
@@ -313,7 +301,7 @@ def _check_wavelength(water: Water | None, transmitter: Transmitter) -> None:
         )
 
 
-def _check_place(scene: WaterScene, transmitter: Transmitter) -> bool:
+def _check_place(scene: WaterScene, transmitter: plugin_types.Transmitter) -> bool:
     """Return whether laser and receiver are under water.
 
     Refuse both on the sea level, on different sides of the sea, or in layers with different indices.
@@ -340,11 +328,11 @@ def _check_place(scene: WaterScene, transmitter: Transmitter) -> bool:
     return True
 
 
-def _check_cells(surfaces: list[mi.Shape], transmitter: Transmitter) -> None:
+def _check_cells(surfaces: list[mi.Shape], transmitter: plugin_types.Transmitter) -> None:
     """Refuse waves in cells longer than the beam is wide: a shot would meet a single slope."""
     footprint = 2 * transmitter.angular_spread * transmitter.pose.ground_range
     for surface in surfaces:
-        if isinstance(surface, SeaShape) and footprint < surface.sea.cell_size < np.inf:
+        if isinstance(surface, plugin_types.SeaShape) and footprint < surface.sea.cell_size < np.inf:
             raise UserError(
                 f"cell_size = {surface.sea.cell_size:.3g} m is coarser than the beam's footprint on the sea, "
                 f"{footprint:.3g} m: it must be finer, or 'auto'"

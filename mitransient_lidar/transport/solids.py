@@ -22,8 +22,7 @@ _DIELECTRICS = ("SmoothDielectric", "ThinDielectric")
 #: Ray positions within the cells along a side, as cell shares, and distance before a box at which rays begin [m].
 _PLACES, BEFORE = (0.4142, 0.5858), 1e-3
 
-#: Thickness of a flat box over its coordinates, or 1 m: rays along it would meet edges alone.
-_FLAT = 1e-4
+_FLAT = 1e-4  #: Thickness of a flat box over its coordinates, or 1 m: rays along it would meet edges alone.
 
 
 class _Children(mi.TraversalCallback):  # type: ignore[misc]
@@ -142,8 +141,7 @@ def met_numbers(si: mi.SurfaceInteraction3f) -> NDArray[np.uint32]:
 #: Smallest bottom side over the largest solid's side: waves do not follow targets and piers.
 _BOTTOM_PER_LARGEST = 0.25
 
-#: Distance of locations from the bottoms' edges, and of ray starts above them [m].
-_MARGIN = 1e-3
+_MARGIN = 1e-3  #: Distance of locations from the bottoms' edges, and of ray starts above them [m].
 
 
 def bottom_depths(scene: mi.Scene) -> BottomDepths | None:

@@ -19,10 +19,10 @@ from quick_campaign import QUICK, files_of, planned_copy, write_toml
 
 from mitransient_lidar.campaigns import shard as shards
 from mitransient_lidar.campaigns import workers
+from mitransient_lidar.campaigns.runs import FILES, check_versions
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.campaigns.sweep import campaign as run_campaign
 from mitransient_lidar.campaigns.sweep import resume
-from mitransient_lidar.campaigns.versions import FILES, check_versions
 from mitransient_lidar.core.errors import UserError
 
 

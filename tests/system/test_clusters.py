@@ -21,10 +21,10 @@ from quick_campaign import files_of, planned_copy
 from mitransient_lidar._version import __version__
 from mitransient_lidar.campaigns import shard as shards
 from mitransient_lidar.campaigns import workers
+from mitransient_lidar.campaigns.runs import own_versions
 from mitransient_lidar.campaigns.store import DONE, PLANNED, Store
 from mitransient_lidar.campaigns.sweep import campaign as run_campaign
 from mitransient_lidar.campaigns.sweep import resume
-from mitransient_lidar.campaigns.versions import own_versions
 from mitransient_lidar.core.errors import UserError
 
 SILENT = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
@@ -215,7 +215,7 @@ OTHERS = {
         f"mitransient-lidar 0.1.9 instead of {__version__}",
     ),
     "unknown": (
-        "from mitransient_lidar.campaigns import workers, versions; del versions.own_versions",
+        "from mitransient_lidar.campaigns import runs, workers; del runs.own_versions",
         "other files of mitransient-lidar",
     ),
 }

@@ -127,8 +127,6 @@ def _template(count: int, renders: Sequence[int]) -> FloatArray:
 class ImageTrial:
     """A scene's light in a camera's gates.
 
-    Notes
-    -----
     The filters use the camera's fixed pattern, as for a calibrated camera.
     """
 
@@ -149,8 +147,6 @@ class ImageTrial:
     def tuned(self, frames: int, pfa: float) -> ImageTrial:
         """Return the trial whose filters are the best ones for a probability of false alarm.
 
-        Notes
-        -----
         With noise that differs with the target, the best weighted sums are those for a sum of both covariances (T. W.
         Anderson and R. R. Bahadur, Ann. Math. Stat. 33, 420 (1962), doi:10.1214/aoms/1177704568); the shares are the
         best of a few.

@@ -1,4 +1,9 @@
-"""Detection of a known echo in noise and clutter by the best weighted sample sum, and alarm rates with their areas."""
+"""Detection of a known echo by the best weighted sample sum, with alarm rates, and its time by a matched filter.
+
+For the matched filter, ``samples`` are records minus the background, shape (shots, samples), and ``templates`` the echo
+at delays, shape (delays, samples). ``delays_ns`` are at least three equal steps [ns]. The noise ``covariance``, shape
+(samples, samples), is positive definite.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +39,6 @@ class Area(NamedTuple):
 def binomial_rates(successes: npt.ArrayLike, trials: int, confidence: float = 0.95) -> Rates:
     """Return rates with Clopper-Pearson intervals for numbers of successes, 0 to `trials`, in their shape.
 
-    Notes
-    -----
     C. J. Clopper and E. S. Pearson, Biometrika 26, 404 (1934), doi:10.1093/biomet/26.4.404: exact and conservative, so
     that `confidence` is the smallest coverage probability. The limits are beta distribution quantiles.
     """
@@ -64,8 +67,6 @@ def area_under_curve(null: npt.ArrayLike, target: npt.ArrayLike, confidence: flo
     It is the probability that the value with a target is the larger of a pair; equal values count one half. The
     outcomes, shape (trials,), are independent, at least two of each.
 
-    Notes
-    -----
     The standard error follows E. R. DeLong, D. M. DeLong and D. L. Clarke-Pearson, Biometrics 44, 837 (1988),
     doi:10.2307/2531595, equation 5 for one curve. The interval is normal in the area's logit and thus below 1. If all
     pairs are separated, the standard error is 0. The lower limit is then the area at which as many pairs of independent
@@ -107,8 +108,6 @@ def sample_moments(
 
     Arguments as for `ReceiverChain.expected`, plus the sample indices, without a step.
 
-    Notes
-    -----
     Mean and variance come from `ReceiverChain.expected`. Samples are correlated like charge and noise after the
     low-pass, which a logarithm changes little; rounding errors are assumed independent.
     """
@@ -294,8 +293,6 @@ class Cases:
         therefore weighted for its noise and the strongest component of its clutter, and then the detectors for noise
         and their common clutter. Raises `UserError` if the target changes no sample.
 
-        Notes
-        -----
         With the mean increase s and the covariance C the weights C^-1 s are the matched filter, the Neyman-Pearson test
         for normal noise that is the same without and with the target (H. L. Van Trees, Detection, Estimation, and
         Modulation Theory, part I, 1968, section 4.3). Otherwise, the mean of both covariances gives the largest
@@ -353,8 +350,6 @@ def _solved(covariance: FloatArray, signal: FloatArray) -> FloatArray:
 def clutter_covariance(values: FloatArray) -> FloatArray:
     """Return the covariance of samples (cases, samples) over few cases, with correlations shrunk towards 0.
 
-    Notes
-    -----
     J. Schaefer and K. Strimmer, Stat. Appl. Genet. Mol. Biol. 4, 32 (2005), doi:10.2202/1544-6115.1175, table 2, target
     D with unequal variances: the shrinkage is the correlations' estimated variance over their sum of squares. With few
     cases, the sample covariance is singular, and weights would ignore the clutter in its null space.
@@ -370,3 +365,41 @@ def clutter_covariance(values: FloatArray) -> FloatArray:
     share = min(1.0, float(np.sum(variance[off_diagonal])) / total) if total > 0 else 1.0
     correlation[off_diagonal] *= 1 - share
     return np.asarray(correlation * np.outer(deviation, deviation))
+
+
+def delays(samples: FloatArray, templates: FloatArray, delays_ns: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the most likely delays [ns] of echoes with unknown height, shape (shots,).
+
+    The maximum of (x C^-1 s)/sqrt(s C^-1 s) over delays equals the likelihood's maximum with the height fitted, for
+    normal noise (S. M. Kay, Fundamentals of Statistical Signal Processing, volume 2, 1998, section 7.4.2). It is
+    interpolated by a parabola through the best delay and its neighbours, within `delays_ns`.
+    """
+    step = float(delays_ns[1] - delays_ns[0])
+    filters = _filters(covariance, templates.T)
+    score = samples @ (filters / np.sqrt(np.sum(templates.T * filters, axis=0)))
+    best = np.clip(np.argmax(score, axis=1), 1, delays_ns.size - 2)
+    left, middle, right = (score[np.arange(len(samples)), best + shift] for shift in (-1, 0, 1))
+    curvature = left - 2 * middle + right
+    top = np.divide(0.5 * (left - right), curvature, out=np.zeros_like(curvature), where=curvature < 0)
+    return np.asarray(delays_ns[best] + np.clip(top, -1, 1) * step)
+
+
+def delay_bound(templates: FloatArray, delays_ns: FloatArray, covariance: FloatArray) -> float:
+    """Return the smallest standard deviation [ns] of an unbiased time for the middle template with unknown height.
+
+    Cramer-Rao bound for a delay and a height: 1/sqrt(d C^-1 d - (d C^-1 s)^2/(s C^-1 s)) with the derivative
+    d = ds/dt.
+    """
+    i = delays_ns.size // 2
+    echo, slope = templates[i], (templates[i + 1] - templates[i - 1]) / (delays_ns[i + 1] - delays_ns[i - 1])
+    filters = _filters(covariance, np.array([echo, slope]).T)
+    information = float(slope @ filters[:, 1] - (slope @ filters[:, 0]) ** 2 / (echo @ filters[:, 0]))
+    return float(1 / np.sqrt(information))
+
+
+def _filters(covariance: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the covariance's inverse times `right`."""
+    try:
+        return np.asarray(np.linalg.solve(covariance, right))
+    except np.linalg.LinAlgError:
+        raise UserError("covariance must be positive definite: every sample must have noise") from None

@@ -14,15 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.analysis.detection.matched_filter import delay_bound, delays
-from mitransient_lidar.analysis.detection.statistics import (
-    Cases,
-    area_under_curve,
-    exceedance,
-    sample_moments,
-    within_range,
-)
-from mitransient_lidar.analysis.jackknife import jackknife_error
+from mitransient_lidar.analysis.detection import statistics
+from mitransient_lidar.analysis.information.errors import jackknife_error
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 
@@ -34,8 +27,7 @@ COMBINATIONS = ("single", "sum", "brightest", "best")
 #: Half widths of the gate about the target's echo, and of the search for its time, in pulse widths.
 HALF_GATE, HALF_SEARCH = 1.5, 0.8
 
-#: Confidence of all intervals.
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  #: Confidence of all intervals.
 
 _LEVELS = (1e-8, 1e4)  # smallest and largest fraction of the target's signal, or of the pulse energy
 _DELAYS = 41  # in the matched filter
@@ -101,7 +93,7 @@ class Experiment:
     def ranged(self, single: bool, light: FloatArray) -> ReceiverChain:
         """Return the chain with a gain for this light."""
         power, sky = self.on_detectors(single, light)
-        return within_range(self.chain, power, self.bin_width_ns, self.samples, sky)
+        return statistics.within_range(self.chain, power, self.bin_width_ns, self.samples, sky)
 
     def gain(self, single: bool) -> float:
         """Return the factor of the transimpedance that keeps the echo in range, on one detector or one per pixel."""
@@ -110,7 +102,7 @@ class Experiment:
             return 1.0
         return chain.amplifier.transimpedance_ohm / self.chain.amplifier.transimpedance_ohm
 
-    def cases(self, name: str | int, share: float, energy: float, left_out: int | None = None) -> Cases:
+    def cases(self, name: str | int, share: float, energy: float, left_out: int | None = None) -> statistics.Cases:
         """Return a combination's samples, or the samples of one pixel by index."""
         single = name == "single"
         pair = self.light(share, energy, left_out)
@@ -118,7 +110,7 @@ class Experiment:
         found = []
         for light in pair:
             power, sky = self.on_detectors(single, light)
-            mean, covariance = sample_moments(chain, power, self.bin_width_ns, self.samples, sky)
+            mean, covariance = statistics.sample_moments(chain, power, self.bin_width_ns, self.samples, sky)
             count, detectors, samples = mean.shape
             joint = np.zeros((count, detectors, samples, detectors, samples))
             for i in range(detectors):
@@ -126,7 +118,9 @@ class Experiment:
             width = detectors * samples
             found += [mean.reshape(count, width), joint.reshape(count, width, width)]
         matrix = self.matrix(name)
-        return Cases(found[0], found[1], found[2], found[3], detectors).combined(matrix, len(matrix) // samples)
+        return statistics.Cases(found[0], found[1], found[2], found[3], detectors).combined(
+            matrix, len(matrix) // samples
+        )
 
     def matrix(self, name: str | int) -> FloatArray:
         """Return the matrix from all detectors' samples to a combination's or a pixel's."""
@@ -228,9 +222,9 @@ def drawn(trial: Experiment, share: float, pfa: float, shots: int, seed: int) ->
             for record in records[name == "single"]
         )
         thresholds = statistic.threshold(nominal)
-        area = area_under_curve(null, target, CONFIDENCE)
-        rates["drawn_false_alarm"].append(exceedance(null, thresholds, CONFIDENCE))
-        rates["drawn_detection"].append(exceedance(target, thresholds, CONFIDENCE))
+        area = statistics.area_under_curve(null, target, CONFIDENCE)
+        rates["drawn_false_alarm"].append(statistics.exceedance(null, thresholds, CONFIDENCE))
+        rates["drawn_detection"].append(statistics.exceedance(target, thresholds, CONFIDENCE))
         rates["area"].append((area.value, area.low, area.high))
         rates["expected_area"].append(statistic.area())
         rates["expected_detection"].append(statistic.detection(nominal))
@@ -266,9 +260,11 @@ def depth_errors(trial: Experiment, shots: int, seed: int, pulse_fwhm_ns: float,
                 echo = _delayed(trial, single, chain, *mean_pair, steps) @ matrix.T
                 known = cases if count == 1 else cases.others(i)
                 noise = known.covariance(with_target=True)
-                times.append(delays(record[:, i] @ matrix.T - known.null_mean.mean(axis=0), echo, steps, noise))
+                times.append(
+                    statistics.delays(record[:, i] @ matrix.T - known.null_mean.mean(axis=0), echo, steps, noise)
+                )
             depths[name] = metres_per_ns * np.array(times)
-            bounds[name] = metres_per_ns * delay_bound(echo, steps, noise) if count == 1 else math.nan
+            bounds[name] = metres_per_ns * statistics.delay_bound(echo, steps, noise) if count == 1 else math.nan
     levels, bias = {}, []
     for name in COMBINATIONS:
         groups = list(depths[name]) if count > 1 else np.array_split(depths[name][0], _GROUPS)

@@ -63,28 +63,16 @@ def range_from_gates(
 
     Raises `UserError` if shapes disagree or a value is out of range.
 
-    Parameters
-    ----------
-    energy, stderr : array_like, shape (..., gate)
-        Energy in each of at least 3 gates, and its standard error, at least 0.
-    gate_mid : array_like, shape (gate,)
-        Middles of the gates, strictly increasing: depths [m] or times [ns].
-    reach : int, optional
-        Largest echo extent on each side of its strongest gate [gates], 0 to (gates - 3) // 2, at least the number of
-        overlapping gates. By default 2, less with fewer than 7 gates.
-    least_excess : float, optional
-        Least excess over the column of an echo's gate [standard errors], at least 0.
-    saturated : array_like of bool, shape (..., gate), optional
-        Gates whose energy is too small. Pixels that need them have no depth: for an echo and its column, or since an
-        echo may be in them. Gates from the first one on are the column.
+    `energy`, `stderr`, shape (..., gate): energy in each of at least 3 gates, and its standard error, at least 0.
+    `gate_mid`, shape (gate,): middles of the gates, strictly increasing: depths [m] or times [ns]. `reach`: largest
+    echo extent on each side of its strongest gate [gates], 0 to (gates - 3) // 2, at least the number of overlapping
+    gates. By default 2, less with fewer than 7 gates. `least_excess`: least excess over the column of an echo's gate
+    [standard errors], at least 0. `saturated`, shape (..., gate): gates whose energy is too small. Pixels that need
+    them have no depth: for an echo and its column, or since an echo may be in them. Gates from the first one on are the
+    column.
 
-    Returns
-    -------
-    RangeImage
-        Arrays of shape (...); pixels with non-finite energies have NaN depth and confidence 0.
+    Result: arrays of shape (...); pixels with non-finite energies have NaN depth and confidence 0.
 
-    Notes
-    -----
     Column: the larger of two exponentials. One is extrapolated from up to 4 gates before the echo, the other
     interpolated between these and the 2 gates after it. After the echo it is at most the level of these 2 gates, since
     a target may end the column. Energies below their error are replaced by it.

@@ -1,4 +1,7 @@
-"""Errors of fitted parameters, for sample errors that neighbours share, and the chi-squared of a fit."""
+"""Errors of fitted parameters, for sample errors that neighbours share, the chi-squared of a fit, and jackknife errors.
+
+Jackknife estimates of standard errors: Efron and Stein (1981), doi:10.1214/aos/1176345462.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,13 @@ import numpy as np
 
 from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.receiver.electronics import Digitiser
+
+
+def jackknife_error(values: FloatArray) -> float:
+    """Return an estimate's standard error from its values without each of the groups, shape (groups,)."""
+    count = len(values)
+    return math.sqrt((count - 1) / count * float(np.sum((values - values.mean()) ** 2)))
+
 
 _DEGENERATE = 0.999  # correlation between two parameters above which only one combination is known
 _SMOOTHED = 9  # samples over which variances are smoothed
@@ -127,34 +137,20 @@ def estimate_errors(
 ) -> Errors:
     """Return the errors of a weighted least-squares solution.
 
-    Parameters
-    ----------
-    residuals
-        Differences in standard deviations, shape (pixel, time), 0 where a sample is not used.
-    derivatives
-        Model derivatives in standard deviations per unit of each parameter, shape (parameter, pixel, time).
-    noise, model
-        Errors of the waveforms and of the model's Monte Carlo. Standard deviations are relative to the difference's,
-        shape (pixel, time), 0 where a sample is not used; correlations are by the distance in samples, shape (lags,).
-    held
-        Parameters at a bound, which are fixed, shape (parameter,).
-    scaled
-        Whether to multiply the covariance by the reduced chi-squared.
-    known_noise
-        Whether the waveform errors are known. If not, all are the same, differences are in the waveforms' unit, `noise`
-        is 1, and the covariance is multiplied by the reduced chi-squared in any case.
-    batches
-        Deviations of the pass batches of waveforms and model, in standard deviations, shape (batch, pixel, time), whose
-        outer products add up to the errors' covariance; None where there are none.
-    borrows
-        Whether waveforms without batches come from a render, whose errors are correlated over its samples like the
-        model's. The model's batches, scaled to the waveform variances, then serve the waveforms, too.
-    recorded
-        Standard deviations of the render that recorded waveforms come from, relative to the difference's, shape (pixel,
-        time): errors beside `noise`, with the model's correlations and batches.
+    `residuals`: differences in standard deviations, shape (pixel, time), 0 where a sample is not used. `derivatives`:
+    model derivatives in standard deviations per unit of each parameter, shape (parameter, pixel, time). `noise`,
+    `model`: errors of the waveforms and of the model's Monte Carlo. Standard deviations are relative to the
+    difference's, shape (pixel, time), 0 where a sample is not used; correlations are by the distance in samples, shape
+    (lags,). `held`: parameters at a bound, which are fixed, shape (parameter,). `scaled`: whether to multiply the
+    covariance by the reduced chi-squared. `known_noise`: whether the waveform errors are known. If not, all are the
+    same, differences are in the waveforms' unit, `noise` is 1, and the covariance is multiplied by the reduced
+    chi-squared in any case. `batches`: deviations of the pass batches of waveforms and model, in standard deviations,
+    shape (batch, pixel, time), whose outer products add up to the errors' covariance; None where there are none.
+    `borrows`: whether waveforms without batches come from a render, whose errors are correlated over its samples like
+    the model's. The model's batches, scaled to the waveform variances, then serve the waveforms, too. `recorded`:
+    standard deviations of the render that recorded waveforms come from, relative to the difference's, shape (pixel,
+    time): errors beside `noise`, with the model's correlations and batches.
 
-    Notes
-    -----
     With the weighted derivatives J and the covariance C of the weighted differences, the parameter covariance is (J^T
     J)^-1 J^T C J (J^T J)^-1. For independent errors this is (J^T J)^-1. With Q = 1 - J (J^T J)^-1 J^T, the chi-squared
     has the mean tr(Q C) and the variance 2 tr(Q C Q C), like a scaled chi-squared distribution (F. E. Satterthwaite,

@@ -16,14 +16,9 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.information.alignment import (
-    Misfit,
-    best_offset,
-    light_duration,
-    residual_correlation,
-)
-from mitransient_lidar.analysis.information.cramer_rao import SCALE, TIME_OFFSET, free_parameters
+from mitransient_lidar.analysis.information.alignment import Misfit, best_offset, light_duration, residual_correlation
 from mitransient_lidar.analysis.information.errors import NO_BATCHES, Errors, estimate_errors, smoothed_variance
+from mitransient_lidar.analysis.information.fisher import SCALE, TIME_OFFSET, free_parameters
 from mitransient_lidar.analysis.information.fit_table import FittedSamples, fit_table
 from mitransient_lidar.analysis.information.measured import Measured, Prediction, predict
 from mitransient_lidar.core.errors import UserError
@@ -62,19 +57,11 @@ class WaveformFit:
     Raises `UserError` if a start or bounds are invalid, there is nothing to fit, no sample lies within the model's
     time, or the waveforms have no light where the model has.
 
-    Parameters
-    ----------
-    found
-        The waveforms.
-    model
-        Returns ``waveform``, optionally ``waveform_stderr``, and ``waveform_derivative`` over (parameter, pixel, time)
-        or (parameter, row, column, time) for values of the parameters. The same values give the same waveform.
-    starts
-        Starts of the model parameters, and optionally of ``scale`` and ``time_offset_ns``.
-    bounds
-        Lowest and highest values by name; see `free_parameters`.
-    free_scale, free_time
-        Whether scale and time offset of the waveforms are unknown, by default only for uncalibrated waveforms.
+    `found`: the waveforms. `model`: returns ``waveform``, optionally ``waveform_stderr``, and ``waveform_derivative``
+    over (parameter, pixel, time) or (parameter, row, column, time) for values of the parameters. The same values give
+    the same waveform. `starts`: starts of the model parameters, and optionally of ``scale`` and ``time_offset_ns``.
+    `bounds`: lowest and highest values by name; see `free_parameters`. `free_scale`, `free_time`: whether scale and
+    time offset of the waveforms are unknown, by default only for uncalibrated waveforms.
     """
 
     def __init__(
@@ -173,25 +160,19 @@ class WaveformFit:
     def run(self, *, most_renders: int = 60, until: float = math.inf, scale_errors: bool = False) -> xr.Dataset:
         """Fit and return the table of parameters and the fitted waveforms.
 
-        Parameters
-        ----------
-        most_renders, until
-            Renders, 2 to 10000, and time of `time.perf_counter` [s] that end the fit without convergence.
-        scale_errors
-            Whether to multiply covariances by the reduced chi-squared, as is done where errors are unknown.
+        `most_renders`, `until`: renders, 2 to 10000, and time of `time.perf_counter` [s] that end the fit without
+        convergence. `scale_errors`: whether to multiply covariances by the reduced chi-squared, as is done where errors
+        are unknown.
 
-        Returns
-        -------
-        xarray.Dataset
-            Over ``parameter``, each in the unit ``parameter_units``: ``value``, ``stderr``, ``stderr_by_model`` (part
-            by the model's Monte Carlo), ``start``, ``low`` and ``high`` (bounds) and ``at_bound``; ``covariance`` and
-            ``correlation`` over (parameter, other_parameter). Over the waveform dimensions: ``measured``,
-            ``measured_stderr``, ``fitted``, ``fitted_stderr`` (the model's Monte Carlo), ``residual`` in standard
-            deviations of both, and ``used`` (1 for fitted samples). Attributes: ``chi_squared``, its mean ``expected``
-            and ``freedom`` (also for errors that neighbours share), ``probability`` of a larger one, ``renders``,
-            ``rounds``, ``converged``, and ``refused`` (1 where the scene does not explain the waveforms).
-            ``interrupted`` is 1 after Ctrl-C; ``messages`` are sentences on what the waveforms do not determine. The
-            squared ``residual`` values add up to ``chi_squared``.
+        Result: over ``parameter``, each in the unit ``parameter_units``: ``value``, ``stderr``, ``stderr_by_model``
+        (part by the model's Monte Carlo), ``start``, ``low`` and ``high`` (bounds) and ``at_bound``; ``covariance`` and
+        ``correlation`` over (parameter, other_parameter). Over the waveform dimensions: ``measured``,
+        ``measured_stderr``, ``fitted``, ``fitted_stderr`` (the model's Monte Carlo), ``residual`` in standard
+        deviations of both, and ``used`` (1 for fitted samples). Attributes: ``chi_squared``, its mean ``expected`` and
+        ``freedom`` (also for errors that neighbours share), ``probability`` of a larger one, ``renders``, ``rounds``,
+        ``converged``, and ``refused`` (1 where the scene does not explain the waveforms). ``interrupted`` is 1 after
+        Ctrl-C; ``messages`` are sentences on what the waveforms do not determine. The squared ``residual`` values add
+        up to ``chi_squared``.
         """
         self._limit, self._until = integer("most_renders", most_renders, 2, 10_000), until
         self._rendered, self._exhausted = None, False

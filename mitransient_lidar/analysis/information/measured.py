@@ -132,19 +132,14 @@ def measured(
     Raises `UserError` if the file cannot be read, a series has more than one shot, the receiver is unknown, or a value
     is out of range.
 
-    Parameters
-    ----------
-    source
-        A result with ``waveform``, or with the ``signal`` of `analysis.receiver.detect_waveforms`, whose records are
-        averaged; or its EXR or NetCDF file. A CSV file has the column ``time_ns``, one column for each pixel in any
-        unit, and optionally ``NAME_stderr`` with their standard errors. LAS, LAZ and PulseWaves files
-        (`results.waveform_files`) give such a table: their mean waveform, minus the level before the surface.
-    noise
-        Standard deviation of every waveform sample, above 0 and in the waveforms' unit, in place of their own.
-    receiver
-        Receiver of a signal, as for `detect_waveforms`; by default the one that its attributes name. For a table, the
-        receiver whose response and noise the model gets: a preset, an instrument, or a TOML file. After a logarithm,
-        samples are volts, which are expanded; limits and rounding are found from the samples.
+    `source`: a result with ``waveform``, or with the ``signal`` of `analysis.receiver.detect_waveforms`, whose records
+    are averaged; or its EXR or NetCDF file. A CSV file has the column ``time_ns``, one column for each pixel in any
+    unit, and optionally ``NAME_stderr`` with their standard errors. LAS, LAZ and PulseWaves files
+    (`results.waveform_files`) give such a table: their mean waveform, minus the level before the surface. `noise`:
+    standard deviation of every waveform sample, above 0 and in the waveforms' unit, in place of their own. `receiver`:
+    receiver of a signal, as for `detect_waveforms`; by default the one that its attributes name. For a table, the
+    receiver whose response and noise the model gets: a preset, an instrument, or a TOML file. After a logarithm,
+    samples are volts, which are expanded; limits and rounding are found from the samples.
     """
     given = None if noise is None else positive("noise", noise)
     source = with_waveforms(source)

@@ -14,8 +14,8 @@ import xarray as xr
 
 from mitransient_lidar.analysis.retrieval import surface_inputs
 from mitransient_lidar.analysis.retrieval.scattered_light import ScatteredLight
-from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
 from mitransient_lidar.analysis.retrieval.surface_echoes import inside_outline
+from mitransient_lidar.analysis.retrieval.surface_slope import SlopeRefraction, bottom_depth, bottom_gain, variances
 from mitransient_lidar.analysis.waveforms.column_onset import Focusing
 from mitransient_lidar.analysis.waveforms.depth_errors import TYPICAL_SLOPE_VARIANCE
 from mitransient_lidar.analysis.waveforms.echo_detection import error_of_sums
@@ -25,8 +25,7 @@ from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry
 from mitransient_lidar.results.geometry import optional_number, pose_of
 
-#: Largest relative standard error with which a reflectance is given.
-LARGEST_ERROR = 0.5
+LARGEST_ERROR = 0.5  #: Largest relative standard error with which a reflectance is given.
 #: Smallest share of the beam's energy in the pixels at which scattered light does not dominate their echoes.
 LEAST_SHARE = 0.05
 

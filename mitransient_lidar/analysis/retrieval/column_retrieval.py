@@ -21,9 +21,7 @@ from mitransient_lidar.physics.water.water_types import PETZOLD_BACKSCATTER_RATI
 
 _FEWEST_BINS = 3  # in a fit
 _LARGEST_ERROR = 0.5  # relative standard error of a bin: a noisier one has a biased logarithm
-
-#: Beam edge in standard deviations.
-BEAM_EDGE = 3.0
+BEAM_EDGE = 3.0  #: Beam edge in standard deviations.
 
 
 @dataclass(frozen=True)
@@ -32,8 +30,6 @@ class ColumnBins:
 
     Indices, one-way paths in the water to their centres [m], and solid angles of the aperture per area [sr/m^2].
 
-    Notes
-    -----
     The one-way path in the water at the time t is s = c0 (t - t_surface)/(2 n_g), along the refracted axis, to the
     depth s cos(phi). The impulse response is divided by the aperture's solid angle in the water
     (`refraction.solid_angle_per_area`), and its logarithm fitted by A - 2 K s. K is per metre of slant path; K = c for
@@ -109,8 +105,7 @@ class ColumnBins:
 #: attenuation.
 SMALLEST_SPOT = 6.0
 
-#: Relative error of bb and Kd by the method.
-METHOD_ERROR = 0.1
+METHOD_ERROR = 0.1  #: Relative error of bb and Kd by the method.
 
 #: Particle bb/b: the typical value, and a range that includes most natural waters.
 BACKSCATTER_RATIO, BACKSCATTER_RATIOS = PETZOLD_BACKSCATTER_RATIO, (0.003, 0.05)
@@ -151,8 +146,6 @@ def water_of_column(decay: npt.ArrayLike, backscatter: npt.ArrayLike, excess: fl
     and the fraction of the beam in view. `excess` is K minus the absorption [1/m], and `level` the backscatter over
     bb/(2 pi), from `scattered_light.ScatteredLight`.
 
-    Notes
-    -----
     Kd follows Lee, Du and Arnone (2005), doi:10.1029/2004JC002275. c is ill-posed: the signal hardly depends on forward
     scattering. The estimate is a + bw + (bb - bw/2)/r, with the scattering bw by sea water at 532 nm. It is given for
     particles with r = 0.0183 (Petzold's average particle), 0.05 and 0.003. The waters in `water_types` have 0.0033
@@ -188,8 +181,6 @@ def bottom_reflectance(
     bottom echo's energy [J], the column's power [W], extrapolated to the echo's time, and its backscatter [1/(m sr)].
     The angle alpha is the light's angle from the vertical in the water.
 
-    Notes
-    -----
     The ratio is independent of pulse energy, atmosphere, attenuation, and the surface's transmittance, slope and
     focusing, and thus corrects a shot for the sea surface. Assumptions: the same water in all shots, homogeneous down
     to the bottom. An absolute reflectance is as accurate as the backscatter.

@@ -23,23 +23,17 @@ from mitransient_lidar.analysis.retrieval import (
     surface_slope,
 )
 from mitransient_lidar.analysis.retrieval.bottom_errors import ReflectanceFlag, scatter, steadier
-from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain
 from mitransient_lidar.analysis.retrieval.surface_echoes import PixelMap, SeaLidar, sea_shots
+from mitransient_lidar.analysis.retrieval.surface_slope import SlopeRefraction, bottom_depth, bottom_gain
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.validation import FloatArray, in_range, positive
+from mitransient_lidar.results import geometry
 from mitransient_lidar.results.attributes import flagged, label, made_from
 from mitransient_lidar.results.files import Given, dataset_of
-from mitransient_lidar.results.geometry import (
-    lidar_geometry,
-    lidar_system,
-    required_number,
-    share_in_view,
-    spot_diameter,
-)
 
 _LOG = logging.getLogger(__name__)
 
@@ -58,35 +52,21 @@ def surface_slopes(
 
     Raises `UserError` if the dataset lacks pixels, a coordinate or an attribute, or a number is out of range.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Waveforms of at least two pixels.
-    wind_speed : float, optional
-        Wind speed [m/s], 1 to 30, whose sea gives the prior. By default, the scene's if its sea has the Elfouhaily
-        spectrum and the Cox and Munk slopes.
-    wind_direction_deg : float, optional
-        Direction that the wind blows towards, counter-clockwise from +x [degree]. By default, the scene's, or +x.
-    slope_deviation : (float, float), optional
-        Prior for an unknown sea instead: standard deviations of the slopes along the lidar's azimuth and across,
-        averaged over a footprint [1], above 0.
-    efficiency : float, optional
-        As for `bottom`.
+    `dataset`: waveforms of at least two pixels. `wind_speed`: wind speed [m/s], 1 to 30, whose sea gives the prior. By
+    default, the scene's if its sea has the Elfouhaily spectrum and the Cox and Munk slopes. `wind_direction_deg`:
+    direction that the wind blows towards, counter-clockwise from +x [degree]. By default, the scene's, or +x.
+    `slope_deviation`: prior for an unknown sea instead: standard deviations of the slopes along the lidar's azimuth and
+    across, averaged over a footprint [1], above 0. `efficiency`: as for `bottom`.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``shot`` if present: ``slope_along``, positive for a face towards the lidar, ``slope_across``, positive for
-        a rise to the left [1], with ``_stderr``; ``slope_deg`` and ``slope_direction_deg`` of the steepest rise from
-        the lidar's azimuth to the left [degree]; ``surface_range`` along the axis, with ``_stderr``, and
-        ``surface_height`` above the mean level [m], with ``_stderr``; ``plane_misfit`` [ns]. NaN where the pixels do
-        not determine it. Attributes: ``slope_method``: ``times and strengths``, ``times on a sea`` or ``times``; and
-        ``slope_prior_deviation``: prior standard deviations along and across [1] and of the range [m]. Without a sea
-        model, a slope beyond 5 standard deviations of the sea's slopes (attribute ``surface_slope_variance``) is NaN as
-        well, and ``slope_refused`` is 1.
+    Result: over ``shot`` if present: ``slope_along``, positive for a face towards the lidar, ``slope_across``, positive
+    for a rise to the left [1], with ``_stderr``; ``slope_deg`` and ``slope_direction_deg`` of the steepest rise from
+    the lidar's azimuth to the left [degree]; ``surface_range`` along the axis, with ``_stderr``, and ``surface_height``
+    above the mean level [m], with ``_stderr``; ``plane_misfit`` [ns]. NaN where the pixels do not determine it.
+    Attributes: ``slope_method``: ``times and strengths``, ``times on a sea`` or ``times``; and
+    ``slope_prior_deviation``: prior standard deviations along and across [1] and of the range [m]. Without a sea model,
+    a slope beyond 5 standard deviations of the sea's slopes (attribute ``surface_slope_variance``) is NaN as well, and
+    ``slope_refused`` is 1.
 
-    Notes
-    -----
     With a known wind, the estimate is `surface_slope.slopes_on_sea`: slopes averaged over the beam's footprint, with
     errors that hold on this sea. It needs a Gaussian beam and 2 to 64 pixels with outlines. Strengths count if the
     waveform is in W and the efficiency known. Otherwise a plane is fitted to the times; without a prior, its slopes are
@@ -95,7 +75,7 @@ def surface_slopes(
     Times come from the ``gaussian`` estimator. A pixel's light is a Gaussian beam inside its outline, or without
     outlines a point at its centre.
     """
-    lidar = lidar_geometry(dataset.attrs)
+    lidar = geometry.lidar_geometry(dataset.attrs)
     if "pixel" not in dataset.dims or dataset.sizes["pixel"] < 2:
         raise UserError("surface slopes need waveforms of at least 2 pixels over the dimension pixel")
     for name, value in {"wind_speed": wind_speed, "wind_direction_deg": wind_direction_deg}.items():
@@ -113,7 +93,7 @@ def surface_slopes(
         scale = surface_inputs.energy_scale(dataset, efficiency)
         measured = surface_inputs.pixel_echoes(echoes, lidar, light)
         lines = surface_inputs.outlines(dataset)
-        beam = 0.5e-3 * required_number(dataset.attrs, "divergence_mrad")
+        beam = 0.5e-3 * geometry.required_number(dataset.attrs, "divergence_mrad")
         sender = SeaLidar(**vars(lidar), beam=beam, pixels=PixelMap.of_outlines(lines))
         sea = surface_slope.slopes_on_sea(measured, sea_shots(sender, *wind), scale)
         per_height = np.array([1, 1, 1 / math.cos(lidar.off_nadir)])
@@ -171,30 +151,20 @@ def bottom(dataset: xr.Dataset, slopes: xr.Dataset, *, efficiency: float | None 
 
     Raises `UserError` if the dataset lacks an attribute or a number is out of range.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Waveforms; their pixels are summed. All shots must be in the same water.
-    slopes : xarray.Dataset
-        Output of `surface_slopes`. An unknown slope is replaced by 0, an unknown range by the mean sea's.
-    efficiency : float, optional
-        Transmitter and receiver efficiency times the atmosphere's two-way transmittance, 0 to 1. By default, from the
-        attribute ``two_way_efficiency``.
+    `dataset`: waveforms; their pixels are summed. All shots must be in the same water. `slopes`: output of
+    `surface_slopes`. An unknown slope is replaced by 0, an unknown range by the mean sea's. `efficiency`: transmitter
+    and receiver efficiency times the atmosphere's two-way transmittance, 0 to 1. By default, from the attribute
+    ``two_way_efficiency``.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``shot`` if present and ``correction``: ``reflectance`` [1] through a level sea at its mean height
-        (``level``), through the shot's plane (``slope``), and from the ratio of the echo to the column (``column``),
-        with ``reflectance_stderr``; ``depth_m`` below the mean sea level [m], NaN for the last, with ``depth_m_stderr``
-        by noise, method, slope and height of the sea; ``reflectance_corrected`` and ``depth_corrected``, whether the
-        correction was applied: otherwise the value is the one before it. Also ``bottom_energy`` [J],
-        ``reflectance_flags``, sums of `bottom_errors.ReflectanceFlag`, and from the last reflectance
-        ``class_probability`` over ``bottom_class``. NaN without a bottom echo; reflectances are NaN where a flag is
-        set, without a column with a warning. Depth and energy are NaN if the echo comes from a target.
+    Result: over ``shot`` if present and ``correction``: ``reflectance`` [1] through a level sea at its mean height
+    (``level``), through the shot's plane (``slope``), and from the ratio of the echo to the column (``column``), with
+    ``reflectance_stderr``; ``depth_m`` below the mean sea level [m], NaN for the last, with ``depth_m_stderr`` by
+    noise, method, slope and height of the sea; ``reflectance_corrected`` and ``depth_corrected``, whether the
+    correction was applied: otherwise the value is the one before it. Also ``bottom_energy`` [J], ``reflectance_flags``,
+    sums of `bottom_errors.ReflectanceFlag`, and from the last reflectance ``class_probability`` over ``bottom_class``.
+    NaN without a bottom echo; reflectances are NaN where a flag is set, without a column with a warning. Depth and
+    energy are NaN if the echo comes from a target.
 
-    Notes
-    -----
     Reflectances ``level`` and ``slope`` use the mean attenuation over all shots. The ratio needs a column with at least
     8 bins in each shot, but hardly depends on the slope, and corrects for focusing by waves.
 
@@ -206,11 +176,11 @@ def bottom(dataset: xr.Dataset, slopes: xr.Dataset, *, efficiency: float | None 
     efficiencies and pulse energy are not included.
 
     A correction that is not expected to lower the variance is not applied. The slope correction is left out where
-    `slope_corrections.variances` gives no lower variance with it, and the column correction where its noise exceeds the
+    `surface_slope.variances` gives no lower variance with it, and the column correction where its noise exceeds the
     reflectance scatter over the shots. With at least 8 shots, a correction that increases the reflectance scatter is
     not applied to any, as focusing by waves may have the opposite effect. With fewer shots their scatter is not known.
     """
-    lidar = lidar_geometry(dataset.attrs)
+    lidar = geometry.lidar_geometry(dataset.attrs)
     summed = surface_inputs.summed_pixels(dataset)
     echoes = echo_table.extract(summed, depth_from="mean", layers=2).isel(pixel=0)
     margin = 0.5 * float(echoes.attrs["echo_fwhm_ns"]) * lidar.depth_per_ns
@@ -218,7 +188,7 @@ def bottom(dataset: xr.Dataset, slopes: xr.Dataset, *, efficiency: float | None 
     seabed, column = (echoes.sel(echo=name) for name in ("bottom", "column"))
     seabed = seabed.where(xr.DataArray(flags & ReflectanceFlag.TARGET == 0, dims=seabed["time_ns"].dims))
     time = seabed["time_ns"].values
-    system, share = lidar_system(dataset.attrs, efficiency), share_in_view(dataset)
+    system, share = geometry.lidar_system(dataset.attrs, efficiency), geometry.share_in_view(dataset)
     flags |= np.where(share < bottom_errors.LEAST_SHARE, int(ReflectanceFlag.NO_DIRECT_LIGHT), 0)
     share = np.where(share < bottom_errors.LEAST_SHARE, np.nan, share)
     waveforms = Waveforms.from_dataset(summed, None, None, None, None)
@@ -314,29 +284,21 @@ def water(dataset: xr.Dataset, *, efficiency: float | None = None) -> xr.Dataset
 
     Raises `UserError` if the view is too narrow, the dataset lacks an attribute or a number is out of range.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Waveforms; their pixels are summed. The field of view on the sea must be at least 6 m, far wider than the beam.
-    efficiency : float, optional
-        As for `bottom`.
+    `dataset`: waveforms; their pixels are summed. The field of view on the sea must be at least 6 m, far wider than the
+    beam. `efficiency`: as for `bottom`.
 
-    Returns
-    -------
-    xarray.Dataset
-        Over ``shot`` if present: ``column_attenuation``, ``absorption``, ``backscattering`` and ``kd`` with
-        ``_stderr``, and ``attenuation`` with its bounds ``attenuation_low`` and ``attenuation_high`` [1/m]; see
-        `column_retrieval.WaterEstimate`. NaN without a column or where the pixels see less than a twentieth of the
-        beam.
+    Result: over ``shot`` if present: ``column_attenuation``, ``absorption``, ``backscattering`` and ``kd`` with
+    ``_stderr``, and ``attenuation`` with its bounds ``attenuation_low`` and ``attenuation_high`` [1/m]; see
+    `column_retrieval.WaterEstimate`. NaN without a column or where the pixels see less than a twentieth of the beam.
     """
-    lidar = lidar_geometry(dataset.attrs)
+    lidar = geometry.lidar_geometry(dataset.attrs)
     summed = surface_inputs.summed_pixels(dataset)
     end = lidar.surface_time_ns + _DEEPEST_PATH / lidar.metres_per_ns
-    in_range("spot_diameter", spot_diameter(dataset.attrs), column_retrieval.SMALLEST_SPOT, math.inf)
+    in_range("spot_diameter", geometry.spot_diameter(dataset.attrs), column_retrieval.SMALLEST_SPOT, math.inf)
     shallow = summed.isel(time=summed["time"].values < end)
     echoes = echo_table.extract(shallow).isel(pixel=0)
-    column, system = echoes.sel(echo="column"), lidar_system(dataset.attrs, efficiency)
-    share = np.where((seen := share_in_view(dataset)) < bottom_errors.LEAST_SHARE, np.nan, seen)
+    column, system = echoes.sel(echo="column"), geometry.lidar_system(dataset.attrs, efficiency)
+    share = np.where((seen := geometry.share_in_view(dataset)) < bottom_errors.LEAST_SHARE, np.nan, seen)
     waveforms = Waveforms.from_dataset(shallow, None, None, None, None)
     light = scattered_light.of_columns(waveforms, echoes, system, share, dataset)
     decay, decay_error = echoes["attenuation"].values, echoes["attenuation_stderr"].values
@@ -403,7 +365,7 @@ def retrieve(
             efficiency=efficiency,
         )
     parts = [slopes, bottom(dataset, slopes, efficiency=efficiency)]
-    spot = spot_diameter(dataset.attrs)
+    spot = geometry.spot_diameter(dataset.attrs)
     if spot >= column_retrieval.SMALLEST_SPOT:
         parts.append(water(dataset, efficiency=efficiency))
     found = xr.merge(parts, combine_attrs="override", join="exact", compat="override")
@@ -415,7 +377,7 @@ def retrieve(
 
 def _unknown_slopes(dataset: xr.Dataset) -> xr.Dataset:
     """Return the table of `surface_slopes` for a single pixel, which shows the surface height alone."""
-    lidar = lidar_geometry(dataset.attrs)
+    lidar = geometry.lidar_geometry(dataset.attrs)
     echoes = echo_table.extract(dataset, targets=1).isel(pixel=0)
     time, by_noise, by_method = (echoes[f"surface_time_ns{end}"].values for end in ("", "_stderr", "_method_error"))
     distance, error = (0.5e-9 * C0 * one for one in (time, np.hypot(by_noise, by_method)))

@@ -122,11 +122,7 @@ class ScatteredLight:
 
 
 def of_columns(
-    waveforms: Waveforms,
-    echoes: xr.Dataset,
-    system: LidarSystem,
-    share: FloatArray,
-    dataset: xr.Dataset,
+    waveforms: Waveforms, echoes: xr.Dataset, system: LidarSystem, share: FloatArray, dataset: xr.Dataset
 ) -> ScatteredLight | None:
     """Return the light in the water that the mean column of waveforms shows; None where no column is known.
 
@@ -166,28 +162,14 @@ def mean_of_known(values: FloatArray) -> float:
 
 
 def light_of(
-    view: View,
-    decay: float,
-    backscatter: float,
-    path: FloatArray,
-    weights: FloatArray,
-    deepest: float,
-    ratio: float,
+    view: View, decay: float, backscatter: float, path: FloatArray, weights: FloatArray, deepest: float, ratio: float
 ) -> ScatteredLight:
     """Return the light in the water whose column has an exponential.
 
-    Parameters
-    ----------
-    view
-        The lidar.
-    decay, backscatter
-        Attenuation of the exponential along the path [1/m], and its level at the surface as a backscatter [1/(m sr)].
-    path, weights
-        Paths in the exponential's fitted bins [m], and weights of the column's logarithm there, shape (bins,).
-    deepest
-        Path of the bottom echo or deepest light [m].
-    ratio
-        Particle bb/b.
+    `view`: the lidar. `decay`, `backscatter`: attenuation of the exponential along the path [1/m], and its level at the
+    surface as a backscatter [1/(m sr)]. `path`, `weights`: paths in the exponential's fitted bins [m], and weights of
+    the column's logarithm there, shape (bins,). `deepest`: path of the bottom echo or deepest light [m]. `ratio`:
+    particle bb/b.
     """
     bb, a, depth = 2 * np.pi * backscatter / _FIRST_LEVEL, decay, deepest * view.system.cos_water
     for paths in _PATHS:

@@ -21,8 +21,7 @@ from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
 BoolArray = npt.NDArray[np.bool_]
 
-#: Least wind speed [m/s] that Cox and Munk measured.
-LEAST_WIND_SPEED = 1.0
+LEAST_WIND_SPEED = 1.0  #: Least wind speed [m/s] that Cox and Munk measured.
 
 _SEAS, _SHOTS = 4, 150  # realisations, and shots on each
 _CELLS = 512  # per side of a realisation
@@ -149,8 +148,6 @@ def sea_shots(lidar: SeaLidar, wind_speed: float, wind_direction: float, *, seed
     The wind, 1 to 30 m/s, blows towards a direction that is counter-clockwise from the lidar's azimuth [rad]. Raises
     `UserError` if its speed is out of range, or waves move the light by too many beam widths.
 
-    Notes
-    -----
     Seas have the Elfouhaily et al. spectrum (1997, doi:10.1029/97JC00467). Its short waves are scaled to the Cox and
     Munk slope variances (1954, doi:10.1364/JOSA.44.000838). A cell side is a quarter of the beam's standard deviation
     on the sea, at most 0.5 m. Ripples have the slope variance that cells do not resolve; waves longer than the 512

@@ -36,10 +36,7 @@ class Focusing:
     def from_attributes(cls, attributes: Attributes) -> Focusing | None:
         """Read ``wave_focusing_depths`` [m] and ``wave_focusing`` of a result; None without them.
 
-        Raises
-        ------
-        UserError
-            If they are not lists of as many positive numbers, with ascending depths.
+        Raises `UserError` if they are not lists of as many positive numbers, with ascending depths.
         """
         if "wave_focusing" not in attributes:
             return None
@@ -86,12 +83,8 @@ class Fading:
         The column's share of the light is uniformly distributed between clearest water and turbid water that
         backscatters 0.02 1/m. The column is as late as it decays on average.
 
-        Parameters
-        ----------
-        energy
-            That of the echo [unit of the record times s].
-        column
-            Signal of the column at the surface per backscattering coefficient [unit m], 0 where it is not known.
+        `energy`: that of the echo [unit of the record times s]. `column`: signal of the column at the surface per
+        backscattering coefficient [unit m], 0 where it is not known.
         """
         if not self.opaque:
             return np.zeros(energy.shape), np.zeros(energy.shape)

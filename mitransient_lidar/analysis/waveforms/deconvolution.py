@@ -36,24 +36,12 @@ def richardson_lucy(
     accounts for that (Snyder, Hammoud and White 1993). The result is never negative. Each iteration resolves shorter
     structure, including that of the noise.
 
-    Parameters
-    ----------
-    y : ndarray, shape (n, time)
-        Samples less the baseline. Negative y + o are replaced by 0.
-    kernel : (int, ndarray)
-        First lag in bins and weights of the pulse, of sum 1, as from `Pulse.kernel`.
-    offset : array_like, shape (), (n, 1) or (n, time)
-        In the unit of the samples, not negative.
-    iterations : int
-        1 to 10 000.
+    `y`, shape (n, time): samples less the baseline. Negative y + o are replaced by 0. `kernel`: first lag in bins and
+    weights of the pulse, of sum 1, as from `Pulse.kernel`. `offset`, shape (), (n, 1) or (n, time): in the unit of the
+    samples, not negative. `iterations`: 1 to 10 000.
 
-    Returns
-    -------
-    ndarray, shape (n, time)
-        The record for a pulse shorter than a bin, in the unit of the samples and with their sum.
+    Result, shape (n, time): the record for a pulse shorter than a bin, in the unit of the samples and with their sum.
 
-    References
-    ----------
     Richardson 1972, J. Opt. Soc. Am. 62(1), 55-59, doi:10.1364/JOSA.62.000055.
     Lucy 1974, Astron. J. 79(6), 745-754, doi:10.1086/111605.
     Snyder, Hammoud and White 1993, J. Opt. Soc. Am. A 10(5), 1014-1023, doi:10.1364/JOSAA.10.001014.

@@ -39,10 +39,8 @@ _LEVEL = 1e-6  # largest difference of the heights of a level sea [m]
 def corrections_for(instrument: str, given: Given, name: str = "corrections") -> xr.Dataset:
     """Return a correction table, as from `studies.depth_bias`: itself, from a file, or with ``auto`` the shipped one.
 
-    Raises
-    ------
-    UserError
-        If it cannot be read, there is none of the instrument, or it is no such table; `name` is that of the parameter.
+    Raises `UserError` if it cannot be read, there is none of the instrument, or it is no such table; `name` is that of
+    the parameter.
     """
     source = given
     if isinstance(given, str) and given == "auto":
@@ -253,14 +251,8 @@ def turned_pixels(learnt: xr.Dataset, angle_x: FloatArray, angle_y: FloatArray, 
     this angle between the two pixels of the table on its ring which are beside it, with weights 1 - w and w, and has
     the variance w (1 - w) (b_2 - b_1)^2 of their biases b_1 and b_2 besides theirs.
 
-    Parameters
-    ----------
-    learnt
-        Table over ``pixel``, with the variables ``bias`` and ``variance`` [m^2].
-    angle_x, angle_y
-        Pixel centres, away from nadir and to the left, in any unit, shape (pixels,).
-    turn_deg
-        Angle from far to left [deg].
+    `learnt`: table over ``pixel``, with the variables ``bias`` and ``variance`` [m^2]. `angle_x`, `angle_y`: pixel
+    centres, away from nadir and to the left, in any unit, shape (pixels,). `turn_deg`: angle from far to left [deg].
     """
     place = np.asarray(angle_x) + 1j * np.asarray(angle_y)
     radius = np.abs(place)
@@ -378,20 +370,13 @@ def _rate(bias: xr.DataArray, nodes: xr.DataArray, axis: str) -> xr.DataArray:
 def summarize_depths(found: xr.Dataset, truth: npt.ArrayLike) -> dict[str, FloatArray]:
     """Return what the depths of bottoms are worth, over estimator and pixel.
 
-    Parameters
-    ----------
-    found : xarray.Dataset
-        Echoes over shot, pixel, estimator and echo.
-    truth : array_like, shape (shots,)
-        Depth of the bottom below the local surface [m].
+    `found`: echoes over shot, pixel, estimator and echo. `truth`, shape (shots,): depth of the bottom below the local
+    surface [m].
 
-    Returns
-    -------
-    dict
-        ``found``, the share of shots with a depth; ``bias`` and ``spread``, mean error and its standard deviation, of
-        depths within 2 m; ``noise_error`` and ``error``, the median stated errors by noise and in all; ``z``, the root
-        mean square of error over stated error; ``wrong``, the share of shots that err by more than 0.5 m without a
-        flag.
+    Returns `dict`: ``found``, the share of shots with a depth; ``bias`` and ``spread``, mean error and its standard
+    deviation, of depths within 2 m; ``noise_error`` and ``error``, the median stated errors by noise and in all; ``z``,
+    the root mean square of error over stated error; ``wrong``, the share of shots that err by more than 0.5 m without a
+    flag.
     """
     bottom = found.sel(echo="bottom").transpose("shot", "pixel", "estimator")
     depth, noise, method = (bottom[name].values for name in ("depth_m", "depth_m_stderr", "depth_m_method_error"))

@@ -233,19 +233,11 @@ def crossing(
     A line through the logarithms, curved like the summit's Gaussian, crosses the level. The pulse's time from that
     level to its arrival is added: echoes longer than the pulse are too early.
 
-    Parameters
-    ----------
-    window, top : Window and Echoes
-        Samples around the peaks, and their `summit`.
-    level, level_stderr : ndarray, shape (n,)
-        Power, between 0 and the amplitude, and its standard error if it is a fraction of the amplitude, else 0.
-    template : Template
-        Shape of an ideal echo.
+    `window`, `top`: samples around the peaks, and their `summit`. `level`, `level_stderr`, shape (n,): power, between 0
+    and the amplitude, and its standard error if it is a fraction of the amplitude, else 0. `template`: shape of an
+    ideal echo.
 
-    Returns
-    -------
-    time_ns, stderr : ndarray, shape (n,)
-        NaN where the edge does not cross the level.
+    Returns `time_ns`, `stderr`, shape (n,): NaN where the edge does not cross the level.
     """
     high = window.power > level[:, np.newaxis]
     peak = np.nan_to_num(top.time_ns - window.middle)

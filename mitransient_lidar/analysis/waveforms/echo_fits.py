@@ -65,27 +65,14 @@ def gaussian_surface(
     Then the peak is too deep in the column, and no surface is found. Over waves, an A E wider than two echo widths is
     light of the column, and does not count.
 
-    Parameters
-    ----------
-    records, bins, flags : Records and ndarray of int, shape (n,)
-        The waveforms, the surface peak bins, and the echoes' `EchoFlag`.
-    width : float
-        Expected full echo width at half maximum [ns].
-    decay : array_like, shape () or (n,)
-        Column decay rate k [1/ns], above 0, as fitted after the echo or typical.
-    shape : EchoShape
-        Shape of an ideal echo.
-    column : ColumnOnset, optional
-        Blurred form of F; by default for F = 1.
-    level : (ndarray, ndarray), shape (n,) each, optional
-        C from the column behind the echo, extrapolated to the peak, and its standard error; NaN where it is not known.
-    reflects : bool
-        Whether the surface may send light back; otherwise A is 0, and the column's onset is the time.
-    decay_error : array_like, shape () or (n,)
-        Standard error of the logarithm of k.
-    following : ndarray of int, shape (n,), optional
-        Bins of the next echoes, -1 without one. Samples less than 1.5 echo widths before them do not count, except
-        until half a width behind the peak.
+    `records`, `bins`, `flags`, shape (n,): the waveforms, the surface peak bins, and the echoes' `EchoFlag`. `width`:
+    expected full echo width at half maximum [ns]. `decay`, shape () or (n,): column decay rate k [1/ns], above 0, as
+    fitted after the echo or typical. `shape`: shape of an ideal echo. `column`: blurred form of F; by default for F =
+    1. `level`, shape (n,): c from the column behind the echo, extrapolated to the peak, and its standard error; NaN
+    where it is not known. `reflects`: whether the surface may send light back; otherwise A is 0, and the column's onset
+    is the time. `decay_error`, shape () or (n,): standard error of the logarithm of k. `following`, shape (n,): bins of
+    the next echoes, -1 without one. Samples less than 1.5 echo widths before them do not count, except until half a
+    width behind the peak.
     """
     begin = column or ColumnOnset()
     # The brightest depth may be the peak, later than the surface; that of a single shot may be twice as deep.

@@ -229,6 +229,9 @@ def extract(
     return _label(dataset, waveforms, table, settings, several)
 
 
+echoes = extract  #: Name at the top of the package.
+
+
 @dataclass(frozen=True)
 class _Settings:
     estimators: tuple[str, ...]

@@ -16,14 +16,8 @@ _OF_UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its 
 def saturated_spans(saturated: BoolArray, bins: IntArray, width: float) -> FloatArray:
     """Return how many bins are clipped about echoes, 0 of those without a saturated sample within an echo width.
 
-    Parameters
-    ----------
-    saturated
-        Whether samples are saturated, shape (n, time).
-    bins
-        Peak bins, -1 without an echo, shape (echo, n).
-    width
-        Echo width in bins, by which runs of saturated samples may be apart to count as one.
+    `saturated`: whether samples are saturated, shape (n, time). `bins`: peak bins, -1 without an echo, shape (echo, n).
+    `width`: echo width in bins, by which runs of saturated samples may be apart to count as one.
     """
     count, index = saturated.shape[1], np.arange(saturated.shape[1])
     if not saturated.any():
@@ -76,17 +70,10 @@ def may_be_second_return(
 def level_error(rest: FloatArray, inflated: float, samples: npt.NDArray[np.floating]) -> FloatArray:
     """Return the standard error of weak steady signals above the level without light, shape (pixels,).
 
-    Parameters
-    ----------
-    rest
-        Samples without light less this level, shape (shots, pixels, bins).
-    inflated
-        Standard deviation ratio for means of samples, neighbouring to independent.
-    samples
-        Samples with light, whose least difference is the step of the digitiser.
+    `rest`: samples without light less this level, shape (shots, pixels, bins). `inflated`: standard deviation ratio for
+    means of samples, neighbouring to independent. `samples`: samples with light, whose least difference is the step of
+    the digitiser.
 
-    Notes
-    -----
     Noise with standard deviation s spreads a level over digitiser steps h: rounding shifts the mean by h/pi exp(-2 pi^2
     s^2/h^2) at most (B. Widrow, I. Kollar, M.-C. Liu, IEEE Trans. Instrum. Meas. 45, 353 (1996)). Without noise, each
     of signal and level is uniformly distributed over a step.

@@ -13,19 +13,10 @@ from typing import Any
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import (
-    FloatArray,
-    finite,
-    integer,
-    number_list,
-    number_within,
-)
+from mitransient_lidar.core.validation import FloatArray, finite, integer, number_list, number_within
 
-#: Text that leaves the choice of a value to the scene.
-AUTO = "auto"
-
-#: Wavelengths [nm] of lasers for which values at 532 nm stand.
-GREEN_LASERS = (510.0, 540.0)
+AUTO = "auto"  #: Text that leaves the choice of a value to the scene.
+GREEN_LASERS = (510.0, 540.0)  #: Wavelengths [nm] of lasers for which values at 532 nm stand.
 
 
 def is_green(wavelength_nm: float | None) -> bool:

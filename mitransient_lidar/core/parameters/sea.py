@@ -8,8 +8,7 @@ from mitransient_lidar.core.parameters.lidar import DIVERGENCES, LARGEST_COORDIN
 # A parameter a row, which the formatter would spread over five.
 # fmt: off
 
-#: Longest side of a sea or a bottom [m].
-LARGEST_SIDE = 1e6
+LARGEST_SIDE = 1e6  #: Longest side of a sea or a bottom [m].
 
 
 def _angle(name: str, meaning: str) -> Parameter:

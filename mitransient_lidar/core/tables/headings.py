@@ -17,15 +17,13 @@ logger = logging.getLogger(__name__)
 _WAVELENGTH = re.compile(r"@?(\d{3,4}(?:\.\d+)?)(nm)?")
 _LETTERS_AND_WAVELENGTH = re.compile(r"([a-z][a-z ]*?)[-@]?(\d{3,4}(?:\.\d+)?)(nm)?")
 
-#: Wavelengths that differ by less [nm] are the same.
-_SAME_WAVELENGTH = 0.05
+_SAME_WAVELENGTH = 0.05  #: Wavelengths that differ by less [nm] are the same.
 
 _SPELLINGS = str.maketrans({"µ": "u", "μ": "u", "⁻": "-", "¹": "1", "^": None, "*": None, "·": None})
 
 _METRIC = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "dm": 0.1}
 
-#: The foot of US surveys, 2e-6 longer than the international one [m].
-_SURVEY_FOOT = 1200 / 3937
+_SURVEY_FOOT = 1200 / 3937  #: The foot of US surveys, 2e-6 longer than the international one [m].
 
 #: Metres, and other units of length, in small letters without blanks and underscores.
 METRES = {
@@ -52,8 +50,7 @@ PER_METRE = {
     "perm": 1.0,
 }
 
-#: Ratio units.
-UNITLESS = {"1": 1.0, "-": 1.0, "%": 1e-2}
+UNITLESS = {"1": 1.0, "-": 1.0, "%": 1e-2}  #: Ratio units.
 
 _NANOSECONDS = {"ns": 1.0, "ps": 1e-3, "us": 1e3, "ms": 1e6, "s": 1e9}
 

@@ -34,27 +34,18 @@ logger = logging.getLogger(__name__)
 #: Words for a missing value, in small letters: pandas' own, and dashes.
 MISSING = frozenset({"", "nan", "-nan", "na", "n/a", "<na>", "#n/a", "#na", "null", "none", "-", "--", "---"})
 
-#: Values that instruments write for missing ones.
-_FILL_VALUES = (-99.0, -999.0, -9999.0, -99999.0, -9.99e-29)
+_FILL_VALUES = (-99.0, -999.0, -9999.0, -99999.0, -9.99e-29)  #: Values that instruments write for missing ones.
 
-#: Most lines in a table.
-_MOST_LINES = 10**6
-
-#: Lines in which the number of columns shows.
-_LINES_FOR_WIDTH = 10_000
-
-#: Characters of the lines above the first row in which the heading is looked for.
-_LONGEST_HEAD = 2**16
-
-#: Times [ns] without a unit that span less are probably seconds.
-_SHORTEST_RECORD = 1e-3
+_MOST_LINES = 10**6  #: Most lines in a table.
+_LINES_FOR_WIDTH = 10_000  #: Lines in which the number of columns shows.
+_LONGEST_HEAD = 2**16  #: Characters of the lines above the first row in which the heading is looked for.
+_SHORTEST_RECORD = 1e-3  #: Times [ns] without a unit that span less are probably seconds.
 
 _COMMENT = re.compile(r"(#(?!N/?A)|%|//|!)[#%/!]*\s*")
 _INLINE_COMMENT = re.compile(r"#(?!N/?A).*")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
-#: Blanks in a heading that do not stand before a unit.
-_BETWEEN_NAMES = re.compile(r"\s+(?![\[(]|1/\w|m\^?-1|in\s)")
+_BETWEEN_NAMES = re.compile(r"\s+(?![\[(]|1/\w|m\^?-1|in\s)")  #: Blanks in a heading that do not stand before a unit.
 
 
 class Table(NamedTuple):
@@ -98,18 +89,10 @@ def read_table(
     log. Raises `UserError` if the file cannot be read or is not text; a name, unit or wavelength is unknown, or a
     column is there twice; or a line does not contain one number for each column.
 
-    Parameters
-    ----------
-    path : path-like
-        Text file in UTF-8; a byte order mark may precede it.
-    columns : sequence of Column
-        Columns that the file may have.
-    ignored : collection of str
-        Names of other columns that it may have, in lower case; the log reports that they are not used.
-    wavelength_nm : float, optional
-        Wavelength [nm] of the columns, if the file has several.
-    positional : bool
-        Whether a file without heading has exactly `columns`, in their order and first units.
+    `path`: text file in UTF-8; a byte order mark may precede it. `columns`: columns that the file may have. `ignored`:
+    names of other columns that it may have, in lower case; the log reports that they are not used. `wavelength_nm`:
+    wavelength [nm] of the columns, if the file has several. `positional`: whether a file without heading has exactly
+    `columns`, in their order and first units.
     """
     text = read_text(path)
     if (count := text.count("\n")) > _MOST_LINES:
@@ -333,11 +316,7 @@ def _values(
 
 
 def _invalid_line(
-    path: str | PathLike[str],
-    line: Line,
-    names: Sequence[str],
-    headings: Sequence[Heading | None],
-    column: int | None,
+    path: str | PathLike[str], line: Line, names: Sequence[str], headings: Sequence[Heading | None], column: int | None
 ) -> UserError:
     """Return the error for a line with a wrong number of cells, or with one in `column` that is no number."""
     where = f"{path}, line {line.number}"
@@ -368,11 +347,8 @@ def is_number_or_missing(cell: str) -> bool:
     return cell.lower() in MISSING or _number(cell) is not None
 
 
-#: Largest table [bytes], and most rows in it.
-_LARGEST, _MOST_ROWS = 2**29, 10**7
-
-#: Beginning of a table in which its heading and its separator are found [bytes].
-_HEAD = 2**16
+_LARGEST, _MOST_ROWS = 2**29, 10**7  #: Largest table [bytes], and most rows in it.
+_HEAD = 2**16  #: Beginning of a table in which its heading and its separator are found [bytes].
 
 #: Chooses table columns by the names in its heading, empty without one: their indices and meanings.
 Choice = Callable[[list[str]], list[tuple[int, Heading]]]

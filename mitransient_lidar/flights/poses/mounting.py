@@ -66,10 +66,7 @@ def pulse_poses(trajectory: Trajectory, mounting: Mounting, scanner: Scanner, ti
     `trajectory`, `mounting`, `scanner`: platform motion, scanner place on it, and scan. `times`: times of the pulses
     [s], on the flight lines, shape (shots,).
 
-    Raises
-    ------
-    UserError
-        For a time that is not finite or on no flight line.
+    Raises `UserError` for a time that is not finite or on no flight line.
     """
     platform = trajectory.at(times)
     parts = np.split(platform.time_s, np.flatnonzero(np.diff(platform.line)) + 1)

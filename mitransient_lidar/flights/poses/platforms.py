@@ -16,17 +16,13 @@ from mitransient_lidar.core.validation import FloatArray, finite_array
 from mitransient_lidar.flights.poses.records import PlatformPoses, RotationSpec, TimeSystem, time_system
 from mitransient_lidar.flights.poses.trajectory import Interpolation, Trajectory, read_sbet_records, read_text_records
 
-#: Most flight lines, and most records of all of them.
-_MOST_LINES, _MOST_RECORDS = 10_000, 10_000_000
+_MOST_LINES, _MOST_RECORDS = 10_000, 10_000_000  #: Most flight lines, and most records of all of them.
 
 #: Records of a correlation time: interpolated between two of them, the variance is at most 2.5 % less.
 _RECORDS_PER_CORRELATION = 20
 
-#: Largest code of a coordinate system.
-_LARGEST_EPSG = 10**6
-
-#: Form of a position.
-XYZ = "x, y and z in metres"
+_LARGEST_EPSG = 10**6  #: Largest code of a coordinate system.
+XYZ = "x, y and z in metres"  #: Form of a position.
 
 _Deviation = Option("Standard deviation", 0, 45, "deg")
 _Heading = Annotated[float, Option("Course, or direction of the forward axis, clockwise from north", unit="deg")]

@@ -39,9 +39,7 @@ def rotation_matrices(
 
     `roll_deg`, `pitch_deg`, `yaw_deg`: angles [deg], shape (n,). `rotation_spec`: order of the rotations.
 
-    Returns
-    -------
-    Rotation matrices, shape (n, 3, 3).
+    Result: shape (n, 3, 3).
     """
     angles = {"roll": roll_deg, "pitch": pitch_deg, "yaw": yaw_deg}
     first, second, third = (
@@ -68,17 +66,13 @@ _LOG = logging.getLogger(__name__)
 #: Systems of times: from any beginning, that of a GPS week, 6 January 1980, and 10^9 s later, in 2011.
 TimeSystem = Literal["flight", "gps_week", "gps", "adjusted_gps"]
 
-#: What adjusted GPS times are less than those since 1980 [s].
-ADJUSTMENT_S = 1e9
+ADJUSTMENT_S = 1e9  #: What adjusted GPS times are less than those since 1980 [s].
 
 #: Latest time of a week whose flight ends on the next day, and earliest adjusted time [s], of January 2012.
 _LATEST_OF_WEEK, _EARLIEST_ADJUSTED = 8 * 86_400, 1e7
 
-#: Earliest time that may be Unix time [s], of September 2020, and GPS time of 2030.
-_MAY_BE_UNIX = 1.6e9
-
-#: Unix time less GPS time [s], with the 18 leap seconds since 2017.
-_UNIX_LESS_GPS = 315_964_782
+_MAY_BE_UNIX = 1.6e9  #: Earliest time that may be Unix time [s], of September 2020, and GPS time of 2030.
+_UNIX_LESS_GPS = 315_964_782  #: Unix time less GPS time [s], with the 18 leap seconds since 2017.
 
 _EPOCH = datetime.datetime(1980, 1, 6)
 
@@ -92,14 +86,8 @@ def time_system(time_s: FloatArray, file: str | None = None, *, is_sbet: bool = 
 
     Raises UserError if the times may be Unix times.
 
-    Parameters
-    ----------
-    time_s
-        Times [s], not empty.
-    file
-        File of the trajectory, None for other platforms.
-    is_sbet
-        Whether that is an SBET file.
+    `time_s`: times [s], not empty. `file`: file of the trajectory, None for other platforms. `is_sbet`: whether that is
+    an SBET file.
     """
     latest = float(np.max(time_s))
     if file is None:
@@ -124,8 +112,7 @@ def tell_time_system(system: str, time_s: FloatArray) -> None:
         )
 
 
-#: Largest number of a record: angles in double precision keep 0.1 millidegrees.
-_LARGEST = 1e12
+_LARGEST = 1e12  #: Largest number of a record: angles in double precision keep 0.1 millidegrees.
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,19 +130,10 @@ class PlatformPoses:
 def check_records(records: PlatformPoses, source: str, place: Callable[[int], str]) -> None:
     """Check that there are 2 records or more, of numbers from -1e12 to 1e12, at times that increase.
 
-    Parameters
-    ----------
-    records
-        Records whose arrays have matching lengths.
-    source
-        Name of all of them, for messages.
-    place
-        Name of a record, by its index from 0, for messages.
+    `records`: records whose arrays have matching lengths. `source`: name of all of them, for messages. `place`: name of
+    a record, by its index from 0, for messages.
 
-    Raises
-    ------
-    UserError
-        For the first record with a fault.
+    Raises `UserError` for the first record with a fault.
     """
     count = len(records.time_s)
     if count < 2:

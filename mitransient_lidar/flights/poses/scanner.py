@@ -13,14 +13,9 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option, Plan, of_kind, positive_option
 from mitransient_lidar.core.validation import FloatArray, finite_array
 
-#: Part of the interval between two points of a raster by which a pulse may be early.
-_EARLY = 1e-6
-
-#: Most points of a raster.
-_MOST_POINTS = 10**9
-
-#: Form of angles from one end to the other.
-_TWO = "two angles in degrees"
+_EARLY = 1e-6  #: Part of the interval between two points of a raster by which a pulse may be early.
+_MOST_POINTS = 10**9  #: Most points of a raster.
+_TWO = "two angles in degrees"  #: Form of angles from one end to the other.
 
 #: Motion of a mirror within a cycle, between -1 and 1, and parameters of several scanners.
 Wave = Literal["triangular", "sinusoidal", "sawtooth"]
@@ -54,10 +49,7 @@ class Scanner(Plan, ABC):
     def of_table(given: object) -> Scanner:
         """Return the scanner of a plan's ``[scanner]`` table: ``kind`` (`SCANNER_KINDS`) and its parameters.
 
-        Raises
-        ------
-        UserError
-            For a key or a value that is not allowed or is missing.
+        Raises `UserError` for a key or a value that is not allowed or is missing.
         """
         return of_kind("scanner", given, SCANNER_KINDS)
 

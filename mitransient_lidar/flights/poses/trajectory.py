@@ -157,11 +157,8 @@ Interpolation = Literal["linear", "cubic"]
 #: Longest time between records that splines go through, with its rounding, and fewest of such records [s].
 _DENSE_S, _FEWEST_DENSE = 1.0 + 1e-6, 3
 
-#: Most pulses of a flight.
-_MOST_PULSES = 10**8
-
-#: Pulses later than the end of a line by less than this part of their interval belong to it.
-_LAST_PULSE = 1e-6
+_MOST_PULSES = 10**8  #: Most pulses of a flight.
+_LAST_PULSE = 1e-6  #: Pulses later than the end of a line by less than this part of their interval belong to it.
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,23 +181,13 @@ class Trajectory(PlatformPoses):
     time, or cubic splines (twice differentiable, not-a-knot ends) through records that follow each other within 1 s,
     and linear elsewhere. Angles take the shorter way round.
 
-    Parameters
-    ----------
-    time_s, position, roll_deg, pitch_deg, yaw_deg
-        The records, 2 or more at strictly increasing times.
-    rotation_spec
-        Order of the rotations, as in `records.rotation_matrices`.
-    interpolation
-        ``linear``, or ``cubic`` for records of a motion that is smooth.
-    lines
-        First and last time [s] of each flight line, within the records and in order, shape (lines, 2); by default one
-        line from the first record to the last.
+    `time_s`, `position`, `roll_deg`, `pitch_deg`, `yaw_deg`: the records, 2 or more at strictly increasing times.
+    `rotation_spec`: order of the rotations, as in `records.rotation_matrices`. `interpolation`: ``linear``, or
+    ``cubic`` for records of a motion that is smooth. `lines`: first and last time [s] of each flight line, within the
+    records and in order, shape (lines, 2); by default one line from the first record to the last.
 
-    Raises
-    ------
-    UserError
-        For arrays of other shapes, another interpolation, and for the first record that is not finite or not later than
-        the one before.
+    Raises `UserError` for arrays of other shapes, another interpolation, and for the first record that is not finite or
+    not later than the one before.
     """
 
     rotation_spec: RotationSpec = "aerospace"
@@ -258,10 +245,7 @@ class Trajectory(PlatformPoses):
     def pulse_times(self, pulse_rate_hz: float) -> FloatArray:
         """Return the times [s] of pulses on all flight lines, shape (pulses,); each line begins with a pulse.
 
-        Raises
-        ------
-        UserError
-            For a rate [Hz] that is not positive or gives more than 10^8 pulses.
+        Raises `UserError` for a rate [Hz] that is not positive or gives more than 10^8 pulses.
         """
         rate = positive("pulse_rate_hz", pulse_rate_hz)
         # Times since 1980 are rounded by a tenth of a microsecond.

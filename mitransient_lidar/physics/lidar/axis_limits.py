@@ -23,23 +23,15 @@ COLUMN_LEVEL, SOLID_LEVEL = 1e-6, 1e-12
 #: energy arrives later.
 _SHALLOW, _LATER_NS, _LATER_SHARE = 4.0, 40.0, 0.25
 
-#: Largest distance from the beam at which the time of the way from it is added for the view [m].
-_FARTHEST = 10.0
+_FARTHEST = 10.0  #: Largest distance from the beam at which the time of the way from it is added for the view [m].
 
 #: Horizontal distance from the lines of sight, over the depth, within which waves and scattering light a solid.
 _REACH_PER_DEPTH = 0.3
 
-#: Largest number of times that the height range of a solid in view is narrowed.
-_NARROWINGS = 6
-
-#: Directions at a cone's edge, and circles of such directions within it.
-_EDGE, _CIRCLES = 128, 8
-
-#: A bottom that ends this share of its lines of sight makes the water below it count no more.
-_COVERED = 0.98
-
-#: Greatest height of the plane of the earliest light, relative to the lower instrument's altitude.
-_HIGHEST = 0.9
+_NARROWINGS = 6  #: Largest number of times that the height range of a solid in view is narrowed.
+_EDGE, _CIRCLES = 128, 8  #: Directions at a cone's edge, and circles of such directions within it.
+_COVERED = 0.98  #: A bottom that ends this share of its lines of sight makes the water below it count no more.
+_HIGHEST = 0.9  #: Greatest height of the plane of the earliest light, relative to the lower instrument's altitude.
 
 _NS_PER_M = 1e9 / C0
 
@@ -145,8 +137,6 @@ class LidarView:
 
         The sea returns no light in a `dry` view or beam, which meets land alone.
 
-        Notes
-        -----
         Light follows directions in both view and beam. The first light is reflected at the height of the highest crest,
         or of a solid above it. The last light comes from the deepest part of a solid in these directions, or within 0.3
         of its depth of them, below a level sea at the height of the lowest trough. Multiply scattered light follows it:
@@ -270,8 +260,6 @@ def system_attenuation(attenuation: ArrayLike, kd: ArrayLike, spot_diameter: Arr
     downwelling irradiance [1/m], at least 0. `spot_diameter`: diameter D of the spot on the sea surface that the lidar
     illuminates and views [m], at least 0.
 
-    Notes
-    -----
     Gordon (1982), Appl. Opt. 21, 2996, doi:10.1364/AO.21.002996, solved the transfer by Monte Carlo for a level sea.
     The signal decays exponentially over four attenuation lengths. It decays with c where the radius R of the spot in
     view is far below 1/c, and with Kd where c R is above 5 to 6. Between them K depends on c and the whole volume

@@ -13,24 +13,19 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.validation import ArrayLike, FloatArray, finite_array, in_range, positive
 
-#: Sun's angular radius [deg].
-SUN_RADIUS_DEG = 0.2666
-
-#: Largest sun zenith angle [deg].
-LARGEST_SUN_ZENITH_DEG = 89.0
+SUN_RADIUS_DEG = 0.2666  #: Sun's angular radius [deg].
+LARGEST_SUN_ZENITH_DEG = 89.0  #: Largest sun zenith angle [deg].
 
 #: Extraterrestrial irradiance [W m^-2 nm^-1]: mean over 527 to 537 nm in Gregg and Carder's table. Fraunhofer lines
 #: change it by up to 4 % within a nanometre.
 _SOLAR_CONSTANT = 1.90
 
-#: Ozone absorption [1/cm], same table, at 532 nm.
-_OZONE_ABSORPTION = 0.0662
+_OZONE_ABSORPTION = 0.0662  #: Ozone absorption [1/cm], same table, at 532 nm.
 
 #: Single-scattering albedo of maritime aerosol at 80 % relative humidity (equation 36, air mass type 1).
 _AEROSOL_ALBEDO = 0.993
 
-#: Pressure [hPa] for the Rayleigh optical depth.
-_SEA_LEVEL_PRESSURE = 1013.25
+_SEA_LEVEL_PRESSURE = 1013.25  #: Pressure [hPa] for the Rayleigh optical depth.
 
 
 class ClearSkyIrradiance(NamedTuple):
@@ -52,23 +47,11 @@ def clear_sky_irradiance(
 ) -> ClearSkyIrradiance:
     """Irradiance by sun and sky at 532 nm on the sea under a clear sky.
 
-    Parameters
-    ----------
-    zenith_deg : float
-        Sun zenith angle [deg], 0 to 89.
-    aerosol_optical_depth : float
-        Aerosol optical depth at 550 nm, 0 to 5.
-    angstrom_exponent : float
-        Exponent of its decrease with wavelength, -1 to 3; it also sets the aerosol's scattering asymmetry.
-    ozone_cm : float
-        Ozone column [atm cm], 0 to 1.
-    pressure_hpa : float
-        Pressure at sea level [hPa], 0 (no Rayleigh scattering) to 1100.
-    wavelength_nm : float
-        Wavelength [nm] that the irradiance must represent, 510 to 540.
+    `zenith_deg`: sun zenith angle [deg], 0 to 89. `aerosol_optical_depth`: aerosol optical depth at 550 nm, 0 to 5.
+    `angstrom_exponent`: exponent of its decrease with wavelength, -1 to 3; it also sets the aerosol's scattering
+    asymmetry. `ozone_cm`: ozone column [atm cm], 0 to 1. `pressure_hpa`: pressure at sea level [hPa], 0 (no Rayleigh
+    scattering) to 1100. `wavelength_nm`: wavelength [nm] that the irradiance must represent, 510 to 540.
 
-    Notes
-    -----
     Gregg and Carder's model (1990, doi:10.4319/lo.1990.35.8.1657) for cloudless maritime atmospheres, at one
     wavelength; the aerosol is given by its optical depth instead of visibility and winds. Its rms error against
     measured spectra is 6.6 %. Air mass: Kasten and Young (1989, doi:10.1364/AO.28.004735). As in the original model,

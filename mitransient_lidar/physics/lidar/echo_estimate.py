@@ -51,22 +51,10 @@ def water_and_bottoms(
 ) -> tuple[Arrivals, Arrivals]:
     """Return the light of water, and of bottoms of reflectance pi in the middle of each of its steps of equal depth.
 
-    Parameters
-    ----------
-    system
-        Transmitter and receiver, at one place with one axis.
-    coefficients
-        Absorption and scattering of the water [1/m], the latter above 0.
-    phase
-        Its phase function.
-    slope_variance
-        Total variance of the Gaussian slopes of waves and ripples [1].
-    depth
-        Depth of the last light [m].
-    shape
-        Number of paths, and of steps: the shape of the results.
-    rng
-        Source of random numbers.
+    `system`: transmitter and receiver, at one place with one axis. `coefficients`: absorption and scattering of the
+    water [1/m], the latter above 0. `phase`: its phase function. `slope_variance`: total variance of the Gaussian
+    slopes of waves and ripples [1]. `depth`: depth of the last light [m]. `shape`: number of paths, and of steps: the
+    shape of the results. `rng`: source of random numbers.
     """
     (a, b), (paths, steps) = coefficients, shape
     spread = _scattered(system, coefficients, phase, depth, shape, rng)

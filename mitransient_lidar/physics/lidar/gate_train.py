@@ -36,20 +36,17 @@ from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.piecewise_linear import first_crossing, integral
 
-#: Points in a weight table per shortest time scale, and largest number of points.
-_POINTS, _MOST_POINTS = 128, 2**17
+_POINTS, _MOST_POINTS = 128, 2**17  #: Points in a weight table per shortest time scale, and largest number of points.
 
 #: Full length of a raised-cosine edge over its 10-90 % time: sin^2 passes 0.1 and 0.9 at 0.2048 and 0.7952 of it.
 _EDGE_PER_RISE = float(np.pi / (np.pi - 2 * np.arccos(0.8)))
 
-#: Cells per bin that give the error of cut gates.
-_CELLS_OF_BIN = 33
+_CELLS_OF_BIN = 33  #: Cells per bin that give the error of cut gates.
 
 #: Samples per standard deviation in a jittered edge, and standard deviations on each side.
 _JITTER_POINTS, _JITTER_REACH = 32, 6.0
 
-#: Relative tolerance for half edges against the width, for rounded decimals.
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  #: Relative tolerance for half edges against the width, for rounded decimals.
 
 _TRANSMISSION = Column("transmission", ("transmittance", "gate", "gain", "value"), UNITLESS)
 
@@ -60,8 +57,6 @@ class GateShape:
 
     Build one with `edges`, `sampled` or `from_file`.
 
-    Notes
-    -----
     An edge with full length L is sin^2(pi u / (2 L)) for 0 <= u <= L, half open in its middle. It is smooth and finite,
     with an integral in closed form, R(t) = (u - L/pi sin(pi u/L)) / 2 for u = t + L/2. A gate is the difference between
     two such edges, its integral the difference between theirs. Edges of 0 ns are sharp; the gate is then half open as
@@ -234,12 +229,8 @@ class GateTrain(Checked):
         `gate`: gate index, 0 to count - 1. `time_start_ns`, `bin_width_ns`: start of the first bin, and bin width [ns].
         `bin_count`: number of bins, 1 to 10^9.
 
-        Returns
-        -------
-        first : int
-            First bin that the gate overlaps.
-        weights : ndarray, shape (M,)
-            Exact means of the transmission over bins first to first + M - 1; M is 0 for a gate outside the axis.
+        Returns `first`: first bin that the gate overlaps. `weights`, shape (M,): exact means of the transmission over
+        bins first to first + M - 1; M is 0 for a gate outside the axis.
         """
         start, width = finite("time_start_ns", time_start_ns), positive("bin_width_ns", bin_width_ns)
         bins = integer("bin_count", bin_count, 1, 10**9)
@@ -332,15 +323,13 @@ class GatePlan:
     """Gates of a scene: a train whose start is replaced by one given in time, in depth or in range."""
 
     train: GateTrain
-    #: Name of the film parameter: ``gate_start_ns``, ``gate_start_depth`` or ``gate_start_range``.
-    given: str
+    given: str  #: Name of the film parameter: ``gate_start_ns``, ``gate_start_depth`` or ``gate_start_range``.
     #: Its value: half-height time of the first gate's rising edge [ns]; or the depth below the mean sea level, or range
     #: from the lidar [m], from which echoes on the receiver's axis arrive then.
     start: float
 
 
-#: Orders in which a camera takes the gates of a frame.
-ORDERS = ("in_order", "interleaved", "random")
+ORDERS = ("in_order", "interleaved", "random")  #: Orders in which a camera takes the gates of a frame.
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,8 @@ from mitransient_lidar.core.parameters.fields import Read
 from mitransient_lidar.core.validation import ArrayLike, Checked, FloatArray, checked, finite_array, in_range, positive
 from mitransient_lidar.physics.lidar.pose import Pose
 
-#: Steps of Newton's method, and the relative change at which it ends.
-_STEPS, _CHANGE = 60, 4e-16
-
-#: Directions nearer to the horizon than this sine are taken as horizontal.
-_SMALLEST_DESCENT = 1e-9
+_STEPS, _CHANGE = 60, 4e-16  #: Steps of Newton's method, and the relative change at which it ends.
+_SMALLEST_DESCENT = 1e-9  #: Directions nearer to the horizon than this sine are taken as horizontal.
 
 
 @dataclass(frozen=True)
@@ -143,10 +140,7 @@ def fresnel(theta: ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
     `theta`: incidence angle [rad], 0 to pi/2. `n`: index behind the interface relative to that before it; below 1 from
     water to air.
 
-    Returns
-    -------
-    reflectance, transmittance : ndarray
-        They add up to 1; the reflectance is 1 beyond the critical angle.
+    Returns `reflectance`, `transmittance`: they add up to 1; the reflectance is 1 beyond the critical angle.
     """
     angle = finite_array("theta", theta)
     cos_i = np.cos(angle)
@@ -310,8 +304,6 @@ def read_divergence(read: Read, is_top_hat: bool = False) -> float | None:
     `read`: reader of the plugin parameters. `is_top_hat`: whether the irradiance is even up to the beam's edge instead
     of Gaussian.
 
-    Notes
-    -----
     A Gaussian exp(-r^2/(2 sigma^2)) has fallen to e^-1/2, to a half and to e^-2 at diameters of 2 sigma, 2 sqrt(2 ln 2)
     sigma = 2.355 sigma and 4 sigma. A top-hat beam has its full irradiance up to its edge and none beyond: all three
     are its full angle.

@@ -11,17 +11,11 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.lidar import LIDAR_TRANSMITTER
 from mitransient_lidar.core.validation import FloatArray, IntArray, in_range
 
-#: Smallest distance of a pose from the mean sea level [m].
-_NEAREST = 0.1
+_NEAREST = 0.1  #: Smallest distance of a pose from the mean sea level [m].
+_UNDER_WATER_RANGE = 10.0  #: Distance from a pose under water at which its axis stands for its beam or view [m].
 
-#: Distance from a pose under water at which its axis stands for its beam or view [m].
-_UNDER_WATER_RANGE = 10.0
-
-#: Vertical component of an axis below which it is taken as level.
-_SMALLEST_DESCENT = 1e-3
-
-#: Horizontal component of an axis below which it has no azimuth.
-_SMALLEST_AZIMUTH = 1e-9
+_SMALLEST_DESCENT = 1e-3  #: Vertical component of an axis below which it is taken as level.
+_SMALLEST_AZIMUTH = 1e-9  #: Horizontal component of an axis below which it has no azimuth.
 
 
 @dataclass(frozen=True)

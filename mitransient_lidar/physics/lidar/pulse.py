@@ -22,9 +22,7 @@ FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
 _TAIL = 1e-10  # energy left out at each kernel end
 _MOST_BINS = 10**7  # in a kernel
 _LONGEST_DIRECT = 2000  # bins of a kernel from which Fourier transforms are faster
-
-#: Lowest sample in a file relative to the largest one; negative samples are noise.
-_LOWEST_SAMPLE = -0.1
+_LOWEST_SAMPLE = -0.1  #: Lowest sample in a file relative to the largest one; negative samples are noise.
 
 _POWER = Column(
     "power",
@@ -122,13 +120,9 @@ class Pulse:
         `bin_width_ns`: bin width [ns], positive. `response_time_ns`: time constant tau of a causal single-pole response
         exp(-t/tau)/tau [ns]; 0 for none.
 
-        Returns
-        -------
-        first_lag : int
-            First weight's lag in bins, usually negative.
-        weights : ndarray, shape (M,)
-            weights[m] is the fraction of an echo in the centre of bin 0 that arrives in bin first_lag + m. They are
-            exact integrals over the bins with the sum 1, truncated where less than 1e-10 lies outside.
+        Returns `first_lag`: first weight's lag in bins, usually negative. `weights`, shape (M,): weights[m] is the
+        fraction of an echo in the centre of bin 0 that arrives in bin first_lag + m. They are exact integrals over the
+        bins with the sum 1, truncated where less than 1e-10 lies outside.
         """
         dt = positive("bin_width_ns", bin_width_ns)
         tau = non_negative("response_time_ns", response_time_ns)
@@ -170,19 +164,11 @@ class Pulse:
 def waveform(energy: ArrayLike, bin_width_ns: float, kernel: tuple[int, FloatArray]) -> FloatArray:
     """Received power from ideal echo energies.
 
-    Parameters
-    ----------
-    energy : array_like, shape (..., time)
-        Energy per bin [J]; at least one bin.
-    bin_width_ns : float
-        Bin width [ns], positive, the kernel's.
-    kernel : (int, ndarray)
-        First lag and weights, from `Pulse.kernel`.
+    `energy`, shape (..., time): energy per bin [J]; at least one bin. `bin_width_ns`: bin width [ns], positive, the
+    kernel's. `kernel`: first lag and weights, from `Pulse.kernel`.
 
-    Returns
-    -------
-    ndarray, shape (..., time)
-        Mean power in each bin [W]. Energy that the kernel moves past either end of the time axis is lost.
+    Result, shape (..., time): mean power in each bin [W]. Energy that the kernel moves past either end of the time axis
+    is lost.
     """
     seconds = positive("bin_width_ns", bin_width_ns) * 1e-9
     histogram = np.asarray(energy, dtype=np.float64)

@@ -12,14 +12,9 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 
-#: Largest number of bins.
-MOST_BINS = 1_000_000
-
-#: Longest time axis of automatic length [ns], in which light travels 3000 km.
-LONGEST_NS = 1e7
-
-#: Parts of a fitted time axis, at least, between the readable times at which it may start and end.
-_PARTS = 20
+MOST_BINS = 1_000_000  #: Largest number of bins.
+LONGEST_NS = 1e7  #: Longest time axis of automatic length [ns], in which light travels 3000 km.
+_PARTS = 20  #: Parts of a fitted time axis, at least, between the readable times at which it may start and end.
 
 
 @dataclass(frozen=True)

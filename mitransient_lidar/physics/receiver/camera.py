@@ -148,18 +148,10 @@ class Camera(Plan):
     ) -> FloatArray:
         """Return the mean events of each pixel and gate, with dark events.
 
-        Parameters
-        ----------
-        energy : array_like, shape (row, column, gate) or (pixel, gate)
-            Energy of the signal in a gate over all pulses [J], not negative.
-        open_ns : array_like
-            Integral of the gate's transmission [ns], not negative: a number, or shape (gate,).
-        background : array_like
-            Daylight power on each pixel [W], not negative: a number, or an array in the shape of the pixels.
-        pulses : int
-            Pulses per frame.
-        pattern : Pattern, optional
-            Fixed pattern; by default all pixels are alike.
+        `energy`, shape (row, column, gate) or (pixel, gate): energy of the signal in a gate over all pulses [J], not
+        negative. `open_ns`: integral of the gate's transmission [ns], not negative: a number, or shape (gate,).
+        `background`: daylight power on each pixel [W], not negative: a number, or an array in the shape of the pixels.
+        `pulses`: pulses per frame. `pattern`: fixed pattern; by default all pixels are alike.
         """
         light, sky = non_negative_array("energy", energy), non_negative_array("background", background)
         if light.ndim not in (2, 3):

@@ -18,22 +18,7 @@ from mitransient_lidar.core.constants import ELEMENTARY_CHARGE
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.processors import usable_processors
 from mitransient_lidar.core.validation import FloatArray, integer, non_negative_array, positive
-from mitransient_lidar.physics.receiver.detectors import (
-    Detector,
-    LinearDetector,
-    SinglePhotonDetector,
-    photons_per_joule,
-)
-from mitransient_lidar.physics.receiver.electronics import (
-    MEAN_OF_BINS,
-    Amplifier,
-    Digitiser,
-    Expected,
-    LogAmplifier,
-    LowPass,
-    Readout,
-    filtered,
-)
+from mitransient_lidar.physics.receiver import detectors, electronics
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter, delayed
 
 _BLOCK = 2**20  # samples drawn at a time, which limits the memory of a thread
@@ -58,8 +43,6 @@ class ReceiverChain:
 
     Raises UserError if the stages do not fit together.
 
-    Notes
-    -----
     Mean and variance are exact up to the amplifier. For logarithm, saturation and rounding a sample is assumed to be
     normally distributed. This holds where the amplifier's noise or tens of photoelectrons within its response dominate.
     With a logarithm and less than one photoelectron, errors of 0.05 standard deviations in the mean and of a third in
@@ -68,10 +51,10 @@ class ReceiverChain:
     Only drawn shots have jitter. Closed forms describe a shot with mean energy at its nominal time.
     """
 
-    detector: Detector  #: A `SinglePhotonDetector` outputs counts and takes no further stages.
-    amplifier: Amplifier | None = None  #: None for an output of charge in electrons per bin.
-    logarithm: LogAmplifier | None = None  #: It requires an amplifier.
-    digitiser: Digitiser | None = None  #: It requires an amplifier.
+    detector: detectors.Detector  #: A `SinglePhotonDetector` outputs counts and takes no further stages.
+    amplifier: electronics.Amplifier | None = None  #: None for an output of charge in electrons per bin.
+    logarithm: electronics.LogAmplifier | None = None  #: It requires an amplifier.
+    digitiser: electronics.Digitiser | None = None  #: It requires an amplifier.
     wavelength_nm: float = 532.0  #: Vacuum wavelength [nm], positive.
     source: str = ""  #: Source of the numbers.
     jitter: ShotJitter | None = None  #: Energy and time jitter of the shots; None for none.
@@ -81,7 +64,7 @@ class ReceiverChain:
         for name in ("logarithm", "digitiser"):
             if self.amplifier is None and getattr(self, name) is not None:
                 raise UserError(f"{name} needs an amplifier, which converts the charge to a voltage")
-        if self.amplifier is not None and isinstance(self.detector, SinglePhotonDetector):
+        if self.amplifier is not None and isinstance(self.detector, detectors.SinglePhotonDetector):
             raise UserError("amplifier must be None behind a SinglePhotonDetector, which outputs counts")
         if self.amplifier is not None and self.amplifier.recovery_ns is not None and self._limit_v() is None:
             raise UserError(
@@ -104,7 +87,7 @@ class ReceiverChain:
         recovers = self.amplifier is not None and not (
             self.amplifier.coupling_ns is None and self.amplifier.recovery_ns is None
         )
-        linear = isinstance(self.detector, LinearDetector) and not self.detector.tail_fractions
+        linear = isinstance(self.detector, detectors.LinearDetector) and not self.detector.tail_fractions
         return linear and not recovers and self.jitter is None
 
     def apply(
@@ -122,23 +105,13 @@ class ReceiverChain:
 
         Returns the signal in `units`, and whether amplifier or digitiser are saturated.
 
-        Parameters
-        ----------
-        power : array_like, shape (..., time)
-            Mean optical power of the signal on the detector in each bin [W], not negative.
-        bin_width_ns : float
-            Bin width [ns], positive.
-        shots : int
-            Number of shots, 1 to 10^9.
-        seed : int
-            Seed of the random numbers, 0 to 2^63 - 1. The same arguments give the same samples on any number of cores.
-        background : array_like
-            Constant power added to the signal [W], not negative: a number, or one for each record.
-        series : bool
-            Whether the first power axis counts different pulses, each with its own energy and trigger. All other
-            records are channels that share a shot's energy and trigger.
-        common_seed : int, optional
-            Seed of energy and trigger, by default `seed`: the same one for channels that are drawn one by one.
+        `power`, shape (..., time): mean optical power of the signal on the detector in each bin [W], not negative.
+        `bin_width_ns`: bin width [ns], positive. `shots`: number of shots, 1 to 10^9. `seed`: seed of the random
+        numbers, 0 to 2^63 - 1. The same arguments give the same samples on any number of cores. `background`: constant
+        power added to the signal [W], not negative: a number, or one for each record. `series`: whether the first power
+        axis counts different pulses, each with its own energy and trigger. All other records are channels that share a
+        shot's energy and trigger. `common_seed`: seed of energy and trigger, by default `seed`: the same one for
+        channels that are drawn one by one.
         """
         light, sky = self._light(power, bin_width_ns, background)
         number, start = integer("shots", shots, 1, 10**9), integer("seed", seed, 0, 2**63 - 1)
@@ -177,14 +150,16 @@ class ReceiverChain:
         whole = number, *np.shape(power)[:-1], shape[-1]
         return Record(record.signal.reshape(whole), record.saturated.reshape(whole))
 
-    def expected(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> Expected:
+    def expected(
+        self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0
+    ) -> electronics.Expected:
         """Return mean, variance and saturation probability of the samples in closed form, in `units`.
 
         Arguments as for `apply`.
         """
         mean, variance = self._unlimited(power, bin_width_ns, background)
         if self.amplifier is None:
-            return Expected(mean, variance, np.zeros_like(mean))
+            return electronics.Expected(mean, variance, np.zeros_like(mean))
         return self.readout(bin_width_ns).expected(mean, variance)
 
     def with_gain(self, factor: float) -> ReceiverChain:
@@ -194,17 +169,13 @@ class ReceiverChain:
         """
         if self.amplifier is None:
             raise UserError(f"gain = {factor:g} needs an amplifier, which this receiver lacks")
-        if isinstance(self.detector, LinearDetector) and self.detector.dynode_gains:
+        if isinstance(self.detector, detectors.LinearDetector) and self.detector.dynode_gains:
             return replace(self, detector=self.detector.with_gain(factor))
         ohm = self.amplifier.transimpedance_ohm * positive("gain", factor)
         return replace(self, amplifier=replace(self.amplifier, transimpedance_ohm=ohm))
 
     def fitting_gain(
-        self,
-        power: npt.ArrayLike,
-        bin_width_ns: float,
-        background: npt.ArrayLike = 0.0,
-        samples: slice = slice(None),
+        self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0, samples: slice = slice(None)
     ) -> float:
         """Return the largest factor of the gain, at most 1, that keeps samples in range; see `with_gain`.
 
@@ -301,7 +272,7 @@ class ReceiverChain:
         from scipy.stats import gamma
 
         light, sky = self._light(power, bin_width_ns, background)
-        if isinstance(self.detector, SinglePhotonDetector):
+        if isinstance(self.detector, detectors.SinglePhotonDetector):
             return np.ones(np.shape(power)[:-1])
         if self.amplifier is None:
             return np.zeros(np.shape(power)[:-1])
@@ -319,7 +290,7 @@ class ReceiverChain:
         power: npt.ArrayLike,
         bin_width_ns: float,
         background: npt.ArrayLike = 0.0,
-        lit: Expected | None = None,
+        lit: electronics.Expected | None = None,
     ) -> FloatArray:
         """Return the samples' signal-to-noise ratio in one shot, shape (..., sample).
 
@@ -338,9 +309,9 @@ class ReceiverChain:
             ratio = np.where(rise == 0, 0, rise / np.sqrt(lit.variance))
         return np.where(lit.saturation > 0.5, np.nan, ratio)
 
-    def low_pass(self, bin_width_ns: float) -> LowPass:
+    def low_pass(self, bin_width_ns: float) -> electronics.LowPass:
         """Return the response of the amplifier, if any, for a bin width [ns]."""
-        return MEAN_OF_BINS if self.amplifier is None else self.amplifier.low_pass(bin_width_ns)
+        return electronics.MEAN_OF_BINS if self.amplifier is None else self.amplifier.low_pass(bin_width_ns)
 
     def events(self, power: FloatArray, bin_width_ns: float, background: FloatArray) -> FloatArray:
         """Return mean primary events in parts of bins, plus the parts before and after that the low-pass needs.
@@ -351,7 +322,10 @@ class ReceiverChain:
         low_pass = self.low_pass(bin_width_ns)
         ends = [(0, 0)] * (power.ndim - 1) + [(low_pass.before, low_pass.after)]
         photons = (
-            (np.pad(power, ends) + background[..., None]) * 1e-9 * bin_width_ns * photons_per_joule(self.wavelength_nm)
+            (np.pad(power, ends) + background[..., None])
+            * 1e-9
+            * bin_width_ns
+            * detectors.photons_per_joule(self.wavelength_nm)
         )
         part = bin_width_ns / low_pass.parts
         events = self.detector.event_means(low_pass.divided(photons), part)
@@ -362,7 +336,7 @@ class ReceiverChain:
     def _steady_events(self, bin_width_ns: float, background: FloatArray) -> FloatArray:
         """Return mean primary events by background [W] and dark current in a part of a bin, shape (..., 1)."""
         parts = self.low_pass(bin_width_ns).parts
-        photons = background[..., None] * 1e-9 * bin_width_ns * photons_per_joule(self.wavelength_nm) / parts
+        photons = background[..., None] * 1e-9 * bin_width_ns * detectors.photons_per_joule(self.wavelength_nm) / parts
         return self.detector.event_means(photons, bin_width_ns / parts)
 
     def _light(
@@ -411,18 +385,18 @@ class ReceiverChain:
         width = bin_width_ns / self.low_pass(bin_width_ns).parts
         return self.amplifier.transimpedance_ohm * ELEMENTARY_CHARGE / (1e-9 * width)
 
-    def readout(self, bin_width_ns: float) -> Readout:
+    def readout(self, bin_width_ns: float) -> electronics.Readout:
         """Return the stages behind the low-pass and the coupling."""
         assert self.amplifier is not None
         recovery = self.amplifier.recovery_ns or 0.0
         hold = math.ceil(recovery / (bin_width_ns * self.stride(bin_width_ns)) - 1e-9)
-        return Readout(self._limit_v(), self.logarithm, self.digitiser, hold)
+        return electronics.Readout(self._limit_v(), self.logarithm, self.digitiser, hold)
 
     def _limit_v(self) -> float | None:
         """Return the largest voltage of amplifier and detector, or None."""
         assert self.amplifier is not None
         limits = [] if self.amplifier.limit_v is None else [self.amplifier.limit_v]
-        if isinstance(self.detector, LinearDetector) and math.isfinite(self.detector.largest_current_ma):
+        if isinstance(self.detector, detectors.LinearDetector) and math.isfinite(self.detector.largest_current_ma):
             limits.append(1e-3 * self.detector.largest_current_ma * self.amplifier.transimpedance_ohm)
         return min(limits, default=None)
 
@@ -439,5 +413,5 @@ class ReceiverChain:
         deviation, weights = self.amplifier.noise(bin_width_ns, stride)
         if deviation > 0:
             normal = random.standard_normal((*volts.shape[:-1], volts.shape[-1] + weights.size - 1))
-            volts += deviation * filtered(normal, weights)
+            volts += deviation * electronics.filtered(normal, weights)
         return self.readout(bin_width_ns).read(volts)

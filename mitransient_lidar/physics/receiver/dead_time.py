@@ -68,8 +68,6 @@ def firing_probability(events: FloatArray, dead: DeadBins) -> tuple[FloatArray, 
 
     fired = live (1 - exp(-events)), and live is 1 minus the probability of firing in the dead bins before.
 
-    Notes
-    -----
     P. B. Coates, J. Phys. E 1, 878 (1968), doi:10.1088/0022-3735/1/8/437, for a dead time up to the end of the record.
     """
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
@@ -105,22 +103,11 @@ def pair_covariances(
 ) -> list[FloatArray]:
     """Covariances between one cell's counts in pairs of bins.
 
-    Parameters
-    ----------
-    events, dead, fired
-        Arguments and result of `firing_probability`, or of `firing_probability_paralyzable`.
-    lags : int
-        Number of lags, at least 1.
-    paralyzable : bool
-        Whether every event restarts the dead time.
+    `events`, `dead`, `fired`: arguments and result of `firing_probability`, or of `firing_probability_paralyzable`.
+    `lags`: number of lags, at least 1. `paralyzable`: whether every event restarts the dead time.
 
-    Returns
-    -------
-    list of ndarray
-        Item l contains the covariance between the counts in bins k and k + l, shape (..., time - l).
+    Result: item l contains the covariance between the counts in bins k and k + l, shape (..., time - l).
 
-    Notes
-    -----
     A count renews the process (Feller 1948, "On probability problems in the theory of counters"): the probability of
     another count at lag l follows from the recursion of `firing_probability` started with a count.
     """
@@ -215,19 +202,10 @@ def sample_counter(
 def afterpulse_hazard(probability: float, decay_bins: float, bins: int) -> FloatArray:
     """Return the probability of an afterpulse in a bin if there was none before.
 
-    Parameters
-    ----------
-    probability : float
-        Probability of an afterpulse at any time, above 0 and below 1.
-    decay_bins : float
-        Mean time to an afterpulse in bins, positive.
-    bins : int
-        Record length in bins; none lasts longer.
+    `probability`: probability of an afterpulse at any time, above 0 and below 1. `decay_bins`: mean time to an
+    afterpulse in bins, positive. `bins`: record length in bins; none lasts longer.
 
-    Returns
-    -------
-    ndarray, shape (age,)
-        By bins since the channel is live; the last one is 0 and stands for all later bins.
+    Result, shape (age,): by bins since the channel is live; the last one is 0 and stands for all later bins.
     """
     size = min(math.ceil(-math.log(_LAST_AFTERPULSES) * decay_bins), bins) + 1
     none_until = 1 - probability + probability * np.exp(-np.arange(size + 1) / decay_bins)
@@ -241,22 +219,12 @@ def afterpulse_moments(
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return one channel's count probability in each bin, and covariances between pairs of bins.
 
-    Parameters
-    ----------
-    events : ndarray, shape (..., time)
-        Mean events per bin of a live channel, without afterpulses.
-    dead : DeadBins
-        Bins for which a channel is dead after a count.
-    chances : ndarray, shape (age,)
-        Result of `afterpulse_hazard`.
-    lags : int
-        Number of lags, at least 1.
+    `events`, shape (..., time): mean events per bin of a live channel, without afterpulses. `dead`: bins for which a
+    channel is dead after a count. `chances`, shape (age,): result of `afterpulse_hazard`. `lags`: number of lags, at
+    least 1.
 
-    Returns
-    -------
-    fired : ndarray, shape (..., time)
-    covariances : list of ndarray
-        Item l contains the covariance between the counts in bins k and k + l, shape (..., time - l).
+    Returns `fired`, shape (..., time). `covariances`: item l contains the covariance between the counts in bins k and k
+    + l, shape (..., time - l).
     """
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
     length = len(hit)

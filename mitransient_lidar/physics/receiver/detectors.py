@@ -30,8 +30,6 @@ from mitransient_lidar.physics.receiver import dead_time
 class SignalTail(Plan):
     """Events that follow light events, as a sum of decaying exponentials; the default has none.
 
-    Notes
-    -----
     Delayed events are a Poisson process with the gain, excess noise and shot noise of other events. Their rate is the
     light's rate convolved with sum_i f_i exp(-(t - d_i)/tau_i)/tau_i. After an echo with peak P and a duration w (its
     energy over its peak) much shorter than tau, the tail begins at P f w/tau: 1e-3 times the peak for f = 1e-3 tau/w.
@@ -62,14 +60,8 @@ class SignalTail(Plan):
     def with_tail(self, events: FloatArray, steady: FloatArray, part_ns: float) -> FloatArray:
         """Return mean events, including delayed ones.
 
-        Parameters
-        ----------
-        events : ndarray, shape (..., time)
-            Mean events in parts of bins.
-        steady : ndarray, shape (..., 1)
-            Mean events by background and dark current alone, which were there long before the record.
-        part_ns : float
-            Part width [ns].
+        `events`, shape (..., time): mean events in parts of bins. `steady`, shape (..., 1): mean events by background
+        and dark current alone, which were there long before the record. `part_ns`: part width [ns].
         """
         from scipy.signal import lfilter
 
@@ -107,8 +99,6 @@ def avalanche_excess_noise(gain: float, ionisation_ratio: float) -> float:
     `gain`: mean multiplication M, at least 1. `ionisation_ratio`: effective ratio k of the ionisation coefficients,
     holes over electrons where electrons begin the avalanche, 0 to 1.
 
-    Notes
-    -----
     R. J. McIntyre, IEEE Trans. Electron Devices 13, 164 (1966), doi:10.1109/T-ED.1966.15651.
     """
     multiplication, k = in_range("gain", gain, 1, np.inf), in_range("ionisation_ratio", ionisation_ratio, 0, 1)
@@ -120,8 +110,6 @@ def dynode_excess_noise(dynode_gains: Sequence[float]) -> float:
 
     `dynode_gains`: mean secondary electrons d per electron of each dynode, above 1; at least one dynode.
 
-    Notes
-    -----
     F = 1 + 1/d_1 + 1/(d_1 d_2) + ...; d/(d - 1) for many equal dynodes. Cascade variances: W. Shockley and J. R.
     Pierce, Proc. IRE 26, 321 (1938).
     """
@@ -137,8 +125,6 @@ class LinearDetector(SignalTail):
 
     A photomultiplier's afterpulses are a tail of its signal.
 
-    Notes
-    -----
     The charge of n events is drawn from a gamma distribution with mean n gain and variance n gain^2 (excess_noise - 1).
     The leakage's shot noise is drawn from a normal distribution. Mean and variance are exact, the tail shapes are not.
     """
@@ -253,8 +239,6 @@ class LinearDetector(SignalTail):
 class SiliconPhotomultiplier(SignalTail):
     """Geiger-mode cells in parallel (SiPM, MPPC).
 
-    Notes
-    -----
     Cells without crosstalk are independent: the number of primary avalanches in a bin is binomial. Each makes a
     Borel-distributed total number of avalanches, with mean 1/(1 - L) and variance L/(1 - L)^3, L = -ln(1 - crosstalk)
     (S. Vinogradov, Nucl. Instrum. Methods A 695, 247 (2012), arXiv:1109.2014). Here L is multiplied by the mean
@@ -327,8 +311,6 @@ class SiliconPhotomultiplier(SignalTail):
 class SinglePhotonDetector(SignalTail):
     """Single-photon avalanche diode, or several channels that share the light evenly, with a counter in time bins.
 
-    Notes
-    -----
     The detector is live at the first bin of the record, as if gated on there. The time to an afterpulse is
     exponentially distributed, and an afterpulse may cause another one. Each count begins anew: carriers that earlier
     counts have trapped cease to count, so that the counts are a renewal process with exact moments.

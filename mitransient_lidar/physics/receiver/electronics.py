@@ -83,16 +83,13 @@ class LowPass:
         return np.asarray(sum(by_lag[..., lag : lag + count : stride, lag] for lag in range(bins)))
 
 
-#: Without a low-pass a sample is the mean of its bin.
-MEAN_OF_BINS = LowPass(1, -1, np.ones(1))
+MEAN_OF_BINS = LowPass(1, -1, np.ones(1))  #: Without a low-pass a sample is the mean of its bin.
 
 
 @dataclass(frozen=True)
 class Amplifier(Plan):
     """Transimpedance amplifier or load resistor.
 
-    Notes
-    -----
     A coupling capacitor removes steady light from the signal. An echo with charge Q leaves a baseline that is lower by
     R Q/coupling_ns and recovers as exp(-t/coupling_ns), in full where the echo itself is clipped. The capacitor changes
     neither the amplifier's noise nor the signal variance here; really the latter is less by about the low-pass response
@@ -177,14 +174,10 @@ class Amplifier(Plan):
     def noise(self, bin_width_ns: float, stride: int = 1) -> tuple[float, FloatArray]:
         """Return the amplifier's own noise in samples that are `stride` bins apart.
 
-        Returns
-        -------
-        deviation : float
-            Standard deviation [V]: the density's, over the noise bandwidth of the low-pass. This is pi/2 times the
-            half-power frequency for a single pole and sqrt(pi/ln 16) times it for a Gaussian, or without a low-pass
-            half the inverse bin width.
-        weights : ndarray
-            Weights, with unit sum of squares, that give independent normal numbers the samples' correlation.
+        Returns `deviation`: standard deviation [V]: the density's, over the noise bandwidth of the low-pass. This is
+        pi/2 times the half-power frequency for a single pole and sqrt(pi/ln 16) times it for a Gaussian, or without a
+        low-pass half the inverse bin width. `weights`: weights, with unit sum of squares, that give independent normal
+        numbers the samples' correlation.
         """
         density = (1e-12 * self.noise_pa_per_rthz) ** 2
         if self.load_ohm is not None:
@@ -240,8 +233,6 @@ class LogAmplifier(Plan):
 class Digitiser(Plan):
     """Analogue-to-digital converter.
 
-    Notes
-    -----
     Rounding adds a variance of step^2/12 (W. R. Bennett, Bell Syst. Tech. J. 27, 446 (1948)) if the preceding noise is
     at least about half a step. A steady signal with less noise has an error of up to half a step instead.
     """

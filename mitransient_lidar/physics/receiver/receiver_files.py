@@ -175,15 +175,10 @@ def _shape(amplifier: Amplifier | None) -> tuple[Any, ...] | None:
     return amplifier.bandwidth_mhz, amplifier.response, amplifier.impulse_response
 
 
-def receiver(
-    name: str | os.PathLike[str] | ReceiverChain | ReceiverChannels | Camera,
-) -> ReceiverChannels | Camera:
+def receiver(name: str | os.PathLike[str] | ReceiverChain | ReceiverChannels | Camera) -> ReceiverChannels | Camera:
     """Return a receiver: a preset, a camera or an instrument's receiver by name, or one from a TOML file.
 
-    Raises
-    ------
-    UserError
-        If none has that name, or the file is invalid.
+    Raises `UserError` if none has that name, or the file is invalid.
     """
     if isinstance(name, (ReceiverChannels, Camera)):
         return name
@@ -358,7 +353,5 @@ def _cameras() -> Mapping[str, Camera]:
     return MappingProxyType({name: Camera.of(given, f"{path.name}: {name}", name=name) for name, given in tables})
 
 
-#: Typical chains for 532 nm, with their sources.
-RECEIVERS = _presets()
-#: Typical gated cameras for 532 nm, with their sources.
-CAMERAS = _cameras()
+RECEIVERS = _presets()  #: Typical chains for 532 nm, with their sources.
+CAMERAS = _cameras()  #: Typical gated cameras for 532 nm, with their sources.

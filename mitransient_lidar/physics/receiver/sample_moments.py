@@ -9,13 +9,8 @@ from scipy import sparse
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, non_negative, non_negative_array, positive
+from mitransient_lidar.physics.receiver import detectors
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
-from mitransient_lidar.physics.receiver.detectors import (
-    LinearDetector,
-    SiliconPhotomultiplier,
-    SinglePhotonDetector,
-    photons_per_joule,
-)
 from mitransient_lidar.physics.receiver.electronics import LowPass
 
 _STEP = 1e-3  # events in a cell, or share of the light on a linear detector, in a central difference
@@ -35,36 +30,18 @@ class SampleMoments(NamedTuple):
 
 
 def sample_moments(
-    chain: ReceiverChain,
-    power: FloatArray,
-    directions: FloatArray,
-    bin_width_ns: float,
-    background: float = 0.0,
+    chain: ReceiverChain, power: FloatArray, directions: FloatArray, bin_width_ns: float, background: float = 0.0
 ) -> SampleMoments:
     """Return mean and covariance of one record's samples, and their derivatives.
 
     Raises UserError if a number is out of range, or shapes disagree.
 
-    Parameters
-    ----------
-    chain : ReceiverChain
-        The receiver.
-    power : ndarray, shape (time,)
-        Mean optical power of the signal on the detector in each bin [W], not negative.
-    directions : ndarray, shape (direction, time)
-        Changes in the power per unit of a parameter [W/unit], of either sign.
-    bin_width_ns : float
-        Bin width [ns], positive.
-    background : float
-        Constant power added to the signal [W], not negative.
+    `chain`: the receiver. `power`, shape (time,): mean optical power of the signal on the detector in each bin [W], not
+    negative. `directions`, shape (direction, time): changes in the power per unit of a parameter [W/unit], of either
+    sign. `bin_width_ns`: bin width [ns], positive. `background`: constant power added to the signal [W], not negative.
 
-    Returns
-    -------
-    SampleMoments
-        In `ReceiverChain.units`, and per parameter unit.
+    Result: in `ReceiverChain.units`, and per parameter unit.
 
-    Notes
-    -----
     The amplifier's low-pass, which filters its own noise and the shot noise alike, correlates neighbouring samples. So
     does the dead time of counters and cells; the covariance is exact for all of these. A converter adds an independent
     variance of step^2/12, after a logarithm times its squared inverse slope at the mean (see `Digitiser`). Derivatives
@@ -134,15 +111,15 @@ def _step(chain: ReceiverChain, power: FloatArray, change: FloatArray, seconds: 
     if largest == 0:
         return 0.0
     # Linear detectors have no error at any step; the largest loses the fewest digits.
-    if isinstance(chain.detector, LinearDetector):
+    if isinstance(chain.detector, detectors.LinearDetector):
         return float(power.max() or 1.0) / largest
-    photons = largest * seconds * photons_per_joule(chain.wavelength_nm)
+    photons = largest * seconds * detectors.photons_per_joule(chain.wavelength_nm)
     return _STEP * _cells(chain.detector) / photons
 
 
-def _cells(detector: SiliconPhotomultiplier | SinglePhotonDetector) -> int:
+def _cells(detector: detectors.SiliconPhotomultiplier | detectors.SinglePhotonDetector) -> int:
     """Return the number of cells or channels that share the light."""
-    return detector.channels if isinstance(detector, SinglePhotonDetector) else detector.cells
+    return detector.channels if isinstance(detector, detectors.SinglePhotonDetector) else detector.cells
 
 
 def _amplifier_noise(chain: ReceiverChain, samples: int, width: float) -> FloatArray:

@@ -16,8 +16,6 @@ from mitransient_lidar.core.validation import FloatArray
 class ShotJitter(Plan):
     """Fluctuation of pulse energy, trigger and clocks from shot to shot.
 
-    Notes
-    -----
     Times are normally distributed. A time error sigma is a range error c sigma / (2 n) from the lidar, n the group
     index: 1.1 cm for 0.1 ns in water. It does not change depths between surface and bottom in one channel.
     """
@@ -38,23 +36,12 @@ class ShotJitter(Plan):
     ) -> tuple[FloatArray, FloatArray]:
         """Draw the shots' energy and time.
 
-        Parameters
-        ----------
-        shots : int
-            Shots per record.
-        records : tuple of int
-            Shape of the records.
-        series : bool
-            Whether the first axis counts different shots instead of channels.
-        seed, common_seed : int
-            Seeds for a channel's own numbers, and for numbers that all channels share.
+        `shots`: shots per record. `records`: shape of the records. `series`: whether the first axis counts different
+        shots instead of channels. `seed`, `common_seed`: seeds for a channel's own numbers, and for numbers that all
+        channels share.
 
-        Returns
-        -------
-        energy : ndarray, shape (shots, *records)
-            Energy over its mean.
-        delay_ns : ndarray, shape (shots, *records)
-            Delay of the record's light [ns].
+        Returns `energy`, shape (shots, *records): energy over its mean. `delay_ns`, shape (shots, *records): delay of
+        the record's light [ns].
         """
         shared = (shots, *(size if series and axis == 0 else 1 for axis, size in enumerate(records)))
         whole = (shots, *records)
@@ -76,11 +63,8 @@ def delayed(power: FloatArray, bins: FloatArray) -> FloatArray:
     `power`: means over bins, constant within a bin and 0 before and after the record, shape (records, time). `bins`:
     delays in bins, of either sign, shape (shots, records).
 
-    Returns
-    -------
-    ndarray, shape (shots, records, time)
-        The integral and the first moment are exact, except for light that leaves the record. A delay by the fraction f
-        of a bin widens an echo by a variance of f (1 - f) bins squared.
+    Result, shape (shots, records, time): the integral and the first moment are exact, except for light that leaves the
+    record. A delay by the fraction f of a bin widens an echo by a variance of f (1 - f) bins squared.
     """
     whole = np.floor(bins).astype(np.int64)
     later = (bins - whole)[..., np.newaxis]

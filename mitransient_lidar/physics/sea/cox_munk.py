@@ -12,11 +12,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 
-#: Largest wind speed in all sea models [m/s].
-MAX_WIND_SPEED = 30.0
-
-#: Wind speeds at which Cox and Munk measured [m/s].
-MEASURED_WIND = 1.0, 14.0
+MAX_WIND_SPEED = 30.0  #: Largest wind speed in all sea models [m/s].
+MEASURED_WIND = 1.0, 14.0  #: Wind speeds at which Cox and Munk measured [m/s].
 
 #: Largest share of slopes, by the Gaussian part, for which a series may have a negative density.
 LARGEST_NEGATIVE_SHARE = 0.005
@@ -25,19 +22,11 @@ LARGEST_NEGATIVE_SHARE = 0.005
 def cox_munk(wind_speed: float) -> tuple[float, float]:
     """Slope variances of a clean sea after Cox and Munk.
 
-    Parameters
-    ----------
-    wind_speed : float
-        Wind speed [m/s], 0 to 30. Measured between 1 and 14 m/s, at a height of 12.5 m; extrapolated linearly. The
-        difference from the wind at 10 m is below their error.
+    `wind_speed`: wind speed [m/s], 0 to 30. Measured between 1 and 14 m/s, at a height of 12.5 m; extrapolated
+    linearly. The difference from the wind at 10 m is below their error.
 
-    Returns
-    -------
-    upwind, crosswind : float
-        Slope variances [1]. At zero wind the regression gives 0.003 crosswind.
+    Returns `upwind`, `crosswind`: slope variances [1]. At zero wind the regression gives 0.003 crosswind.
 
-    Notes
-    -----
     Cox and Munk (1954), J. Opt. Soc. Am. 44, 838, doi:10.1364/JOSA.44.000838: 3.16e-3 W and 0.003 + 1.92e-3 W.
     """
     wind = in_range("wind_speed", wind_speed, 0, MAX_WIND_SPEED)
@@ -71,8 +60,6 @@ class GramCharlierSeries:
 
         `wind_speed`: wind speed [m/s], 1 to 14.
 
-        Notes
-        -----
         Cox and Munk (1954): 0.01 - 0.0086 W (+- 0.03), 0.04 - 0.033 W (+- 0.12), 0.40 (+- 0.23), 0.12 (+- 0.06) and
         0.23 (+- 0.41), from slopes up to 2.5 standard deviations.
         """
@@ -102,11 +89,8 @@ class GramCharlierSeries:
     def along(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Return skewness and excess kurtosis of the slope in a direction.
 
-        Parameters
-        ----------
-        x, y
-            Cosines of the direction to crosswind and to upwind, each times the slope's standard deviation in that axis
-            over its standard deviation in the direction: the squares sum to 1.
+        `x`, `y`: cosines of the direction to crosswind and to upwind, each times the slope's standard deviation in that
+        axis over its standard deviation in the direction: the squares sum to 1.
         """
         x2, y2 = x * x, y * y
         skewness = -(self.c03 * y2 + 3 * self.c21 * x2) * y
@@ -123,10 +107,7 @@ class GramCharlierSeries:
     def require_positive(self, advice: str) -> None:
         """Refuse a series whose density is negative for more than half a percent of the slopes.
 
-        Raises
-        ------
-        UserError
-            With `advice` at the end.
+        Raises `UserError` with `advice` at the end.
         """
         share = self.negative_share
         if share > LARGEST_NEGATIVE_SHARE:
@@ -142,8 +123,7 @@ LAWS = ("monahan_omuircheartaigh_1980", "callaghan_2008", "stramska_petelski_200
 #: Reflectance over that at short wavelengths, at wavelengths [nm].
 _SHAPE = ((500.0, 1.0), (600.0, 0.95), (1000.0, 0.5), (1100.0, 0.45))
 
-#: Distance within which crests rise above their surroundings [m].
-SURROUNDINGS = 2.0
+SURROUNDINGS = 2.0  #: Distance within which crests rise above their surroundings [m].
 
 
 def foam_cover(foam: str, wind_speed: float) -> float:
@@ -153,8 +133,6 @@ def foam_cover(foam: str, wind_speed: float) -> float:
 
     `foam`: ``none``, a number from 0 to 1, or the name of a law. `wind_speed`: wind speed U at 10 m [m/s].
 
-    Notes
-    -----
     Monahan and O'Muircheartaigh 1980, doi:10.1175/1520-0485(1980)010<2094:OPLDOO>2.0.CO;2: 2.95e-6 U^3.52. Callaghan et
     al. 2008, doi:10.1029/2008GL036165: 3.18e-5 (U - 3.7)^3 from 3.7 m/s, and 4.82e-6 (U + 1.98)^3 from where both are
     equal, 10.2 m/s. Stramska and Petelski 2003, doi:10.1029/2002JC001321: 8.75e-5 (U - 6.33)^3 from 6.33 m/s. At one

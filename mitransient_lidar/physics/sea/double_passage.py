@@ -33,8 +33,7 @@ _WAVENUMBERS, _DISTANCES, _ANGLES = 400, 120, 16
 #: Displacements of a table [m]: the enhancement falls with their logarithm, below the first one by 0.2 % at most.
 _DISPLACEMENTS = np.geomspace(1e-6, 3.0, 40)
 
-#: Ways whose displacement exceeds the displacement by slopes this many times are independent.
-_FAR_APART = 8.0
+_FAR_APART = 8.0  #: Ways whose displacement exceeds the displacement by slopes this many times are independent.
 
 
 @dataclass(frozen=True, eq=False)

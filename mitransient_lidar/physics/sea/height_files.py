@@ -20,14 +20,10 @@ from mitransient_lidar.core.validation import FloatArray, finite, positive
 
 logger = logging.getLogger(__name__)
 
-#: Relative tolerance of even spacing, for 32-bit numbers and rounded decimals.
-UNEVENNESS = 1e-3
+UNEVENNESS = 1e-3  #: Relative tolerance of even spacing, for 32-bit numbers and rounded decimals.
+_MOST_SCATTERED = 2 * 10**6  #: Most scattered points, whose triangulation takes a kilobyte and 10 microseconds each.
 
-#: Most scattered points, whose triangulation takes a kilobyte and 10 microseconds each.
-_MOST_SCATTERED = 2 * 10**6
-
-#: Least share of grid cells with a point for points to count as a grid.
-_LEAST_SHARE = 0.25
+_LEAST_SHARE = 0.25  #: Least share of grid cells with a point for points to count as a grid.
 
 _X = Column("x", ("easting", "east", "e", "x coordinate", "point x"), METRES)
 _Y = Column("y", ("northing", "north", "n", "y coordinate", "point y"), METRES)
@@ -44,8 +40,7 @@ _ALLOWED = "m, cm, km, ft, ftUS, fathom"
 _NETCDF_NAMES = ("height", "elevation", "depth")
 _NO_UNIT = ("", "1")
 
-#: Grid mapping attributes.
-_GRID_MAPPING = {"crs_wkt", "spatial_ref", "grid_mapping_name"}
+_GRID_MAPPING = {"crs_wkt", "spatial_ref", "grid_mapping_name"}  #: Grid mapping attributes.
 
 
 def length_unit(name: str, unit: str) -> float:
@@ -72,20 +67,10 @@ def heights_in_metres(
     Raises UserError if the unit is unknown, contradicts the file's, or is not stated beside positions that are not in
     metres; or heights are beyond 12 000 m, or look like a value for no data.
 
-    Parameters
-    ----------
-    path : Path
-        Their file, for messages.
-    values : ndarray
-        Values as in the file, NaN where they are declared to be missing.
-    stated : Stated
-        Statements of the file about them.
-    sign : {'heights', 'depths'}, optional
-        Whether they are positive up or down. Default: as the file states, or up.
-    unit : str, optional
-        Their unit, where the file does not state it. Default: metres.
-    no_data : float, optional
-        Value without a height, which the file does not declare.
+    `path`: their file, for messages. `values`: values as in the file, NaN where they are declared to be missing.
+    `stated`: statements of the file about them. `sign`, 'heights' or 'depths': whether they are positive up or down.
+    Default: as the file states, or up. `unit`: their unit, where the file does not state it. Default: metres.
+    `no_data`: value without a height, which the file does not declare.
     """
     if sign not in (None, "heights", "depths"):
         raise UserError(f"map_values = {sign!r} must be heights or depths")
@@ -234,12 +219,8 @@ def read_points(path: Path) -> tuple[FloatArray, Stated]:
     Raises UserError as `read_long_table`; or if columns are missing, ambiguous, in an unknown unit, or angles; x and y
     have different units; or a position is not finite.
 
-    Returns
-    -------
-    points : ndarray, shape (points, 3)
-        x, y and z as in the file; z is NaN where it is missing.
-    stated : Stated
-        Units that the heading states, and whether z is called depth.
+    Returns `points`, shape (points, 3): x, y and z as in the file; z is NaN where it is missing. `stated`: units that
+    the heading states, and whether z is called depth.
     """
 
     def choose(names: list[str]) -> list[tuple[int, Heading]]:

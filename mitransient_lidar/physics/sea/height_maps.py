@@ -17,21 +17,11 @@ from mitransient_lidar.core.formats.array_files import Array, read_exr, read_npy
 from mitransient_lidar.core.maps import Grid, MapSystem, read_ascii_grid, read_bag, read_geotiff
 from mitransient_lidar.core.validation import ArrayLike, BoolArray, FloatArray, IntArray, finite, positive
 from mitransient_lidar.physics.piecewise_linear import locate
-from mitransient_lidar.physics.sea.height_files import (
-    UNEVENNESS,
-    check_positions,
-    described,
-    grid_of_points,
-    heights_in_metres,
-    position_unit,
-    read_netcdf_heights,
-    read_points,
-)
+from mitransient_lidar.physics.sea import height_files
 
 logger = logging.getLogger(__name__)
 
-#: Farthest distance of x = y = 0 from a map [m]: single precision resolves a millimetre there.
-_FARTHEST = 1e4
+_FARTHEST = 1e4  #: Farthest distance of x = y = 0 from a map [m]: single precision resolves a millimetre there.
 
 _Given = tuple[str | None, str | None, float | None]
 """Sign, unit and no-data value for `heights_in_metres`."""
@@ -62,15 +52,10 @@ class HeightMap:
     def sample(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """Return the elevation on grid lines by bilinear interpolation.
 
-        Parameters
-        ----------
-        x, y : array_like, shapes (N,) and (M,)
-            Grid line positions [m]. A point outside the map has the height of the nearest edge point.
+        `x`, `y`, shapes (N,) and (M,): grid line positions [m]. A point outside the map has the height of the nearest
+        edge point.
 
-        Returns
-        -------
-        ndarray, shape (M, N)
-            Elevation [m] at (x[i], y[j]) for element [j, i].
+        Result, shape (M, N): elevation [m] at (x[i], y[j]) for element [j, i].
         """
         (i, right), (j, up) = _cells(self.x, x), _cells(self.y, y)
         columns = self.heights[:, i] * (1 - right) + self.heights[:, i + 1] * right
@@ -175,7 +160,7 @@ def read_height_map(
         "%s: map of %d x %d cells, %g x %g m, heights from %g to %g m%s%s; %s",
         *(path, x.size, y.size, x[-1] - x[0], y[-1] - y[0], np.nanmin(heights), np.nanmax(heights), place),
         ", the centre" if place and origin is None else "",
-        described(grid.stated, values, unit, 0 if filled is None else int(filled.sum())),
+        height_files.described(grid.stated, values, unit, 0 if filled is None else int(filled.sum())),
     )
     return terrain
 
@@ -190,13 +175,13 @@ def map_origin(read: Callable[..., Any]) -> tuple[float, float] | None:
 
 def _points(path: Path, cell: float | None, given: _Given) -> Grid:
     """Return the grid from a point table [m]."""
-    points, stated = read_points(path)
+    points, stated = height_files.read_points(path)
     if len(points):
         spacing = float(np.sqrt(np.ptp(points[:, 0]) * np.ptp(points[:, 1]) / len(points)))
-        check_positions(path, stated, points[:, 0], points[:, 1], spacing)
-    points[:, 2] = heights_in_metres(path, points[:, 2], stated, *given)
-    points[:, :2] *= position_unit(path, stated)
-    return grid_of_points(path, points, stated, cell)
+        height_files.check_positions(path, stated, points[:, 0], points[:, 1], spacing)
+    points[:, 2] = height_files.heights_in_metres(path, points[:, 2], stated, *given)
+    points[:, :2] *= height_files.position_unit(path, stated)
+    return height_files.grid_of_points(path, points, stated, cell)
 
 
 def _in_metres(path: Path, grid: Grid, size: float | None, given: _Given) -> Grid:
@@ -204,7 +189,7 @@ def _in_metres(path: Path, grid: Grid, size: float | None, given: _Given) -> Gri
     heights, stated = _numbers(path, "heights", grid.values), grid.stated
     if heights.ndim != 2 or min(heights.shape) < 2:
         raise UserError(f"{path} has heights of shape {heights.shape}, but must have at least 2 rows and 2 columns")
-    heights = heights_in_metres(path, heights, stated, *given)
+    heights = height_files.heights_in_metres(path, heights, stated, *given)
     counts = {"x": heights.shape[1], "y": heights.shape[0]}
     if len(grid.positions) == 1:
         raise UserError(f"{path} has positions {next(iter(grid.positions))} only: it must have both x and y, or none")
@@ -217,8 +202,8 @@ def _in_metres(path: Path, grid: Grid, size: float | None, given: _Given) -> Gri
         raise _superfluous_size(path, size)
     x, y = (_even_positions(path, name, grid.positions[name], count) for name, count in counts.items())
     at_x, at_y = grid.centre or (0.0, 0.0)
-    check_positions(path, stated, at_x + x, at_y + y, min(float(x[1] - x[0]), float(y[1] - y[0])))
-    unit = position_unit(path, stated)
+    height_files.check_positions(path, stated, at_x + x, at_y + y, min(float(x[1] - x[0]), float(y[1] - y[0])))
+    unit = height_files.position_unit(path, stated)
     return Grid(heights, {"x": unit * x, "y": unit * y}, stated, grid.centre and (unit * at_x, unit * at_y))
 
 
@@ -299,7 +284,7 @@ def _even_positions(path: Path, name: str, values: Array, count: int) -> FloatAr
         )
     spacing = (positions[-1] - positions[0]) / (count - 1)
     worst = int(np.argmax(np.abs(gaps - spacing)))
-    if abs(gaps[worst] - spacing) > UNEVENNESS * spacing:
+    if abs(gaps[worst] - spacing) > height_files.UNEVENNESS * spacing:
         raise UserError(
             f"{path} has {name}[{worst}] and {name}[{worst + 1}] {gaps[worst]:g} apart, but {spacing:g} on average:"
             " positions must be evenly spaced"
@@ -340,7 +325,7 @@ _READERS: dict[str, Callable[[Path], Grid]] = {
     ".npy": lambda path: Grid(read_npy(path), {}),
     ".npz": _read_npz,
     ".exr": _read_exr,
-    ".nc": read_netcdf_heights,
+    ".nc": height_files.read_netcdf_heights,
     ".asc": read_ascii_grid,
     ".tif": read_geotiff,
     ".tiff": read_geotiff,

@@ -24,8 +24,7 @@ from mitransient_lidar.physics.sea.wave_spectrum import (
 #: Largest number of cells per grid side, and number of cells in the long-wave grids of a finer sea.
 _MOST_CELLS, _LONG_WAVE_CELLS = 2048, 1024
 
-#: Largest ratio between the periods of neighbouring grids, odd.
-_MOST_TILES = 31
+_MOST_TILES = 31  #: Largest ratio between the periods of neighbouring grids, odd.
 
 #: Most wavelengths per period of waves that are summed one by one. Others are interpolated on a grid with so many times
 #: the fewest points, by a kernel over so many of them, whose decay suits both.
@@ -52,8 +51,6 @@ def angular_frequency(k: npt.ArrayLike, depth: float = math.inf) -> FloatArray:
 
     `k`: wavenumber [rad/m], not negative. `depth`: water depth [m], positive or infinite.
 
-    Notes
-    -----
     Linear waves (Lamb 1932, Hydrodynamics, sections 229 and 267): omega^2 = (g k + (T/rho) k^3) tanh(k depth) with
     T/rho = g/(370 rad/m)^2 = 7.17e-5 m^3/s^2, the surface tension for the slowest wave in the Elfouhaily spectrum.
     """
@@ -81,21 +78,11 @@ def wave_coefficients(
     Returns complex wave amplitudes [m] at `wave_numbers`; the other half plane is their conjugate. The constant and the
     Nyquist wavenumbers have amplitude 0.
 
-    Parameters
-    ----------
-    spectrum : WaveSpectrum or SeaState
-        Waves to realise. They travel towards the half plane of their direction.
-    period : float
-        Patch side [m], positive. Longer waves are missing.
-    cells : int
-        Cells per side, even, at least 2.
-    seed : int
-        Any integer. A wave depends only on its wavenumber and the seed: with the same period, a coarser realisation
-        equals the finer one without its short waves.
-    motion : Motion
-        Time, depth and current; equal seeds are the same sea at different times.
-    only : int, optional
-        Number of the one wave system to realise, by default all.
+    `spectrum`: waves to realise. They travel towards the half plane of their direction. `period`: patch side [m],
+    positive. Longer waves are missing. `cells`: cells per side, even, at least 2. `seed`: any integer. A wave depends
+    only on its wavenumber and the seed: with the same period, a coarser realisation equals the finer one without its
+    short waves. `motion`: time, depth and current; equal seeds are the same sea at different times. `only`: number of
+    the one wave system to realise, by default all.
     """
     ix, iy, dk = wave_numbers(period, cells)
     time = motion.time
@@ -160,8 +147,6 @@ def facet_slope_variance(
     of wavelengths along x and y over the period, from `wave_numbers`. `period`, `cells`: period [m], and its length in
     cells, which may be broken. `axis`: direction [rad], counter-clockwise from +x.
 
-    Notes
-    -----
     Facet slopes are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d, d the cell side.
     Their covariance is for cells split along the diagonal from (i+1, j) to (i, j+1), averaged over both triangles in a
     cell. It is 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds oblique to the
@@ -181,12 +166,8 @@ def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
 
     `period`, `cells`: as for `wave_coefficients`.
 
-    Returns
-    -------
-    ix, iy
-        Column and row indices of a real FFT, shapes (cells/2 + 1,) and (cells,).
-    dk
-        Wavenumber of one wavelength over the period [rad/m].
+    Returns `ix`, `iy`: column and row indices of a real FFT, shapes (cells/2 + 1,) and (cells,). `dk`: wavenumber of
+    one wavelength over the period [rad/m].
     """
     positive("period", period)
     if cells != int(cells) or cells < 2 or cells % 2:
@@ -289,8 +270,6 @@ class Band:
 class Interpolation:
     """Interpolation of waves from a periodic grid, in single precision.
 
-    Notes
-    -----
     A non-uniform Fourier transform of type 2 with the kernel exp(b ((1 - z^2)^(1/2) - 1)) (Barnett, Magland and af
     Klinteberg 2019, SIAM J. Sci. Comput. 41, C479). Waves are divided by the transform of the kernel.
     """
@@ -382,24 +361,12 @@ def realise_heights(
     Returns the elevations, the cell side [m], and the expected slope variances [1] of the facets along and across the
     axis.
 
-    Parameters
-    ----------
-    spectrum, seed
-        As for `wave_coefficients`.
-    period
-        Sea period [m], positive.
-    cell
-        Largest cell side [m], positive.
-    motion
-        Time, depth and current.
-    axis
-        Axis of the slope variances [rad], counter-clockwise from +x; None for variances of 0, in less time.
-    shortest_wave
-        Wavelength of the shortest waves [m]; shorter than two cells, the waves end there.
-    wavenumbers
-        Band wavenumbers [rad/m], increasing, by which the waves are also divided; by default not divided. A band's
-        share in a wave is a linear function of the logarithm of its wavenumber between neighbouring ones. Swell is the
-        last band, on its own.
+    `spectrum`, `seed`: as for `wave_coefficients`. `period`: sea period [m], positive. `cell`: largest cell side [m],
+    positive. `motion`: time, depth and current. `axis`: axis of the slope variances [rad], counter-clockwise from +x;
+    None for variances of 0, in less time. `shortest_wave`: wavelength of the shortest waves [m]; shorter than two
+    cells, the waves end there. `wavenumbers`: band wavenumbers [rad/m], increasing, by which the waves are also
+    divided; by default not divided. A band's share in a wave is a linear function of the logarithm of its wavenumber
+    between neighbouring ones. Swell is the last band, on its own.
     """
 
     def grid_of_waves(part: float) -> int:

@@ -13,8 +13,7 @@ from mitransient_lidar.core.parameters.fields import AUTO, Read
 from mitransient_lidar.core.validation import FloatArray, IntArray, require_memory
 from mitransient_lidar.physics.lidar.level_sea import read_divergence
 
-#: Ratio between the lengths of neighbouring cells outside the fine patch.
-_GROWTH = 1.3
+_GROWTH = 1.3  #: Ratio between the lengths of neighbouring cells outside the fine patch.
 
 #: Memory of a cell: its heights, triangles, their copy in Mitsuba and the tree in which rays meet them [bytes].
 _BYTES_PER_CELL = 280
@@ -39,10 +38,7 @@ def grid_indices(cells: int, extent: int, growth: float = _GROWTH, meshes: int =
     `growth`: ratio between the lengths of neighbouring cells outside the patch, above 1. `meshes`: number of such
     meshes made at a time.
 
-    Returns
-    -------
-    ndarray of int
-        Symmetric about 0, one apart inside the patch; integers, so that all heights are points of the fine grid.
+    Result: symmetric about 0, one apart inside the patch; integers, so that all heights are points of the fine grid.
     """
     outer, step, end = [], 1.0, cells // 2
     while end < extent / 2:
@@ -101,8 +97,7 @@ _PIXELS_PER_WAVE, _SMALLEST_WAVE, _LARGEST_WAVE = 4.0, 0.08, 2.0
 #: Cells in a beam's shortest wave, fewer where the patch would have too many, and cells per pixel side.
 _CELLS_PER_WAVE, _FEWEST_CELLS_PER_WAVE, _CELLS_PER_PIXEL = 12.0, 4.0, 2.0
 
-#: Limits for automatic cells [m].
-_SMALLEST_CELL, _LARGEST_CELL = 0.02, 0.25
+_SMALLEST_CELL, _LARGEST_CELL = 0.02, 0.25  #: Limits for automatic cells [m].
 
 #: Cells per side in an automatic patch above which waves have fewer cells, and largest number.
 _MANY_CELLS, _MOST_CELLS = 512, 1024
@@ -113,11 +108,8 @@ _SIZE_PER_FOOTPRINT, SIZE_MARGIN = 1.25, 8.0
 #: Side of the surface: least length [m], and factor on the footprints with the margin.
 _LEAST_SURFACE, _SURFACE_PER_SIZE = 1000.0, 2.0
 
-#: Half angle of a beam, in standard deviations.
-_BEAM_HALF_WIDTH = 3.0
-
-#: Full angles [rad] of beam and field of view unless they are given.
-_DIVERGENCE, _FIELD_OF_VIEW = 10e-3, 30e-3
+_BEAM_HALF_WIDTH = 3.0  #: Half angle of a beam, in standard deviations.
+_DIVERGENCE, _FIELD_OF_VIEW = 10e-3, 30e-3  #: Full angles [rad] of beam and field of view unless they are given.
 
 
 @dataclass(frozen=True)
@@ -186,13 +178,9 @@ class Resolution:
 
         Raises UserError if a value is not positive or out of range.
 
-        Parameters
-        ----------
-        read
-            Parameter reader.
-        footprints
-            Footprints of the lasers and receivers above the sea. Values of the parameters ``altitude``,
-            ``off_nadir_deg``, ``divergence_mrad`` (or another definition) and ``field_of_view_mrad`` replace theirs.
+        `read`: parameter reader. `footprints`: footprints of the lasers and receivers above the sea. Values of the
+        parameters ``altitude``, ``off_nadir_deg``, ``divergence_mrad`` (or another definition) and
+        ``field_of_view_mrad`` replace theirs.
         """
         names = ("cell_size", "refined_size", "size", "shortest_wave")
         cell, side, size, wave = (None if value == AUTO else value for value in map(read, names))

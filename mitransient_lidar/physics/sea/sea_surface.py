@@ -59,11 +59,8 @@ _LEAST_VARIANCE = 1e-5
 #: depend on the resolution, so that a seed defines one sea.
 _PERIOD_STEP, _PERIOD_WAVELENGTHS, _LONGEST_PERIOD = 32.0, 3.0, 512.0
 
-#: Water depth [m] from which no wave notices the bottom.
-DEEP = 1e4
-
-#: Wind speed [m/s] below which there are no waves.
-_CALM = 1e-6
+DEEP = 1e4  #: Water depth [m] from which no wave notices the bottom.
+_CALM = 1e-6  #: Wind speed [m/s] below which there are no waves.
 
 #: Largest number of cells per side in the fine patch, and smallest number per period for waves to be resolved.
 _MOST_CELLS, _FEWEST_CELLS = 4096, 16
@@ -71,14 +68,9 @@ _MOST_CELLS, _FEWEST_CELLS = 4096, 16
 #: Side of each of several patches with the cells around it [m], and growth of these.
 _SIZE_OF_PATCH, _GROWTH_OF_PATCH = 200.0, 2.0
 
-#: Grid lines along x and y of a level sea, over its size.
-_LEVEL_LINES = (-0.5, 0.25, 0.5), (-0.5, 0.5)
-
-#: Places on each side of a period by which the highest crests are found.
-_CREST_SAMPLES = 512
-
-#: Most heights of seas at other times that are kept.
-_MOST_HEIGHTS = 2**24
+_LEVEL_LINES = (-0.5, 0.25, 0.5), (-0.5, 0.5)  #: Grid lines along x and y of a level sea, over its size.
+_CREST_SAMPLES = 512  #: Places on each side of a period by which the highest crests are found.
+_MOST_HEIGHTS = 2**24  #: Most heights of seas at other times that are kept.
 
 Wake = Callable[[FloatArray, FloatArray], FloatArray]
 
@@ -122,16 +114,9 @@ class SeaSurface:
 
         Raises UserError if a parameter is out of range, or a file cannot be read.
 
-        Parameters
-        ----------
-        read
-            Parameter reader.
-        footprints
-            Footprints of the lasers and receivers above the sea, for its automatic values.
-        is_placeholder
-            Whether to check the parameters only, and return a sea without waves.
-        depths
-            Depths that waves shall follow (see `followed_depths`), None for deep water.
+        `read`: parameter reader. `footprints`: footprints of the lasers and receivers above the sea, for its automatic
+        values. `is_placeholder`: whether to check the parameters only, and return a sea without waves. `depths`: depths
+        that waves shall follow (see `followed_depths`), None for deep water.
         """
         spectrum, wind_speed = read("spectrum"), read("wind_speed")
         wind_speed = wind_speed if wind_speed >= _CALM else 0.0
@@ -269,21 +254,10 @@ class SeaSurface:
         The patches lie side by side on a square lattice about the origin, each surrounded by cells that grow out to
         `_SIZE_OF_PATCH` or the sea's size.
 
-        Parameters
-        ----------
-        places
-            Sea locations (x, y) [m], shape (n, 2).
-        refined_size
-            Side of each fine patch [m].
-        seas
-            The sea at each location's time.
+        `places`: sea locations (x, y) [m], shape (n, 2). `refined_size`: side of each fine patch [m]. `seas`: the sea
+        at each location's time.
 
-        Returns
-        -------
-        mesh : SeaMesh
-            All patches.
-        positions : ndarray
-            Positions (x, y) of the locations in it [m], shape (n, 2).
+        Returns `mesh`: all patches. `positions`: positions (x, y) of the locations in it [m], shape (n, 2).
         """
         cells = max(2, 2 * math.ceil(0.5 * refined_size / self.cell_size))
         size = max(refined_size, min(self.size, max(_SIZE_OF_PATCH, 2 * refined_size)))

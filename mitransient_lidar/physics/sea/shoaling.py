@@ -13,14 +13,12 @@ from mitransient_lidar.physics.sea.realization import Interpolation, PeriodicHei
 from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.wind_spectra import ShallowSpectrum, SwellSpectrum
 
-#: Largest significant height of waves (four standard deviations) over the local depth.
-HEIGHT_PER_DEPTH = 0.5
+HEIGHT_PER_DEPTH = 0.5  #: Largest significant height of waves (four standard deviations) over the local depth.
 
 #: Ratio between the wavenumbers of neighbouring bands, the first over the peak wavenumber, and the last [rad/m].
 _BAND, _FIRST_BAND, _LAST_BAND = math.sqrt(2), 0.25, 2 * math.pi
 
-#: Amplitude deficit that counts as none: a micrometre in a wave of one metre.
-_NO_CHANGE = 1e-6
+_NO_CHANGE = 1e-6  #: Amplitude deficit that counts as none: a micrometre in a wave of one metre.
 
 #: Depths in the amplitude table: the least one [m], their ratio, and the deepest one times the first wavenumber.
 _LEAST_DEPTH, _DEPTH_RATIO, _DEEPEST = 1e-4, 1.05, 10.0
@@ -67,8 +65,6 @@ def band_wavenumbers(state: SeaState, shortest_wave: float) -> FloatArray:
 class DepthResponse:
     """Band amplitudes at each depth, relative to deep water.
 
-    Notes
-    -----
     Wind waves with the wavenumber k have the TMA spectrum for the depth d_e (`wind_spectra.ShallowSpectrum`): the
     amplitude factor (S(k; d_e)/S(k))^(1/2). At constant frequency this is Kitaigorodskii's variance factor
     tanh(kd)^2/(1 + 2kd/sinh(2kd)). Its form in wavenumbers fits waves that are realised by wavenumber: it keeps the
@@ -81,8 +77,7 @@ class DepthResponse:
     """
 
     depth: FloatArray  #: Increasing depths [m], the first 0, shape (n,).
-    #: Amplitude factors [1], shape (bands, n): wind waves by wavenumber, then swell.
-    amplitude: FloatArray
+    amplitude: FloatArray  #: Amplitude factors [1], shape (bands, n): wind waves by wavenumber, then swell.
     top: int  #: Band number of the shortest wind waves.
     #: Share by which the largest height lessens the effective depth [1], 0 in deep water to 1 at the shore, shape (n,)
     broken: FloatArray

@@ -208,8 +208,6 @@ class MatchedSpectrum(CosineSpectrum):
     scaled, positive. If the others alone have too much slope variance, or a ratio that scaling cannot correct, it is
     reduced in steps of a tenth. Below the longest wave all are scaled.
 
-    Notes
-    -----
     With the fractions 1/2 +- Delta/4 of the slope variance k^2 S, factors s_u and s_c give
     S' = S (s_u (1/2 + Delta/4) + s_c (1/2 - Delta/4)) and Delta' = 2 (s_u (1/2 + Delta/4) - s_c (1/2 - Delta/4)) S/S',
     clipped to ``|Delta'| <= 1`` so that no wave has a negative density; s_u and s_c are found with the clipping.

@@ -37,8 +37,6 @@ def inverse_wave_age(wind_speed: float, fetch: float) -> float:
 
     `wind_speed`: wind speed at 10 m [m/s], 0 to 30. `fetch`: distance from the upwind shore [m], positive.
 
-    Notes
-    -----
     Elfouhaily et al. (1997), doi:10.1029/97JC00467, eq. 37: 0.84 tanh((X/2.2e4)^0.4)^-0.75 with X = g fetch/U^2.
     """
     wind, distance = in_range("wind_speed", wind_speed, 0, MAX_WIND_SPEED), positive("fetch", fetch)
@@ -76,8 +74,6 @@ class WindSpectrum(CosineSpectrum):
 class ElfouhailySpectrum(WindSpectrum):
     """Unified spectrum of wind-driven gravity and capillary waves.
 
-    Notes
-    -----
     Elfouhaily, Chapron, Katsaros and Vandemark (1997), J. Geophys. Res. 102, 15781, doi:10.1029/97JC00467, with the
     drag coefficient 0.00144. The low-frequency roll-off L_PM J_p also acts on the capillary branch; without it waves in
     light winds would be tens of metres high. A negative capillary amplitude in eq. 44 (below 2.2 m/s) is replaced by 0.
@@ -165,8 +161,6 @@ class SaturatedSpectrum(WindSpectrum):
 class PiersonMoskowitzSpectrum(SaturatedSpectrum):
     """Gravity wave spectrum of a fully developed sea.
 
-    Notes
-    -----
     Pierson and Moskowitz (1964), J. Geophys. Res. 69, 5181, doi:10.1029/JZ069i024p05181: alpha = 8.1e-3, beta = 0.74
     and the wind at 19.5 m, here 1.026 times that at 10 m. Measured at 10 to 20 m/s.
     """
@@ -195,8 +189,6 @@ class JonswapSpectrum(SaturatedSpectrum):
     upwind shore [m]: g fetch/U^2 from 0.1, the start of the measurements, to 17 000, where the peak reaches the fully
     developed sea's peak and the growth ends. `peak_enhancement`: gamma, 1 to 7; the mean over the measurements is 3.3.
 
-    Notes
-    -----
     Hasselmann et al. (1973), Dtsch. Hydrogr. Z. Suppl. A8 (12), with X = g fetch/U^2: alpha = 0.076 X^-0.22,
     omega_p = 22 (g/U) X^(-1/3), widths 0.07 below and 0.09 above the peak.
     """
@@ -241,8 +233,6 @@ class JonswapSpectrum(SaturatedSpectrum):
 class ShallowSpectrum(CosineSpectrum):
     """Wind waves in water of finite depth, which limits the long ones.
 
-    Notes
-    -----
     TMA spectrum by Bouws, Guenther, Rosenthal and Vincent (1985), J. Geophys. Res. 90, 975,
     doi:10.1029/JC090iC01p00975: k^3 S(k) and the spreading equal their deep-water values at the same frequency, thus at
     the wavenumber k tanh(k depth). In frequencies it is the deep spectrum times Kitaigorodskii's factor, from (depth

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 
-#: Highest wind speed in the model [m/s].
-STRONGEST_WIND = 20.0
+STRONGEST_WIND = 20.0  #: Highest wind speed in the model [m/s].
 
 CLEAN_BACKSCATTER = 233.0
 """Volume scattering at 180 degrees over void fraction for clean bubbles of any size [1/(m sr)] (Churnside 2010)."""
@@ -46,8 +45,6 @@ class WindBubbles:
 
         Raises UserError if the wind speed lies outside its range.
 
-        Notes
-        -----
         The Hall-Novarini model: n(a) = 1.6e10 (U / 13)^3 exp(-z / L) G(a) in 1/m^4. G = (a_r / a)^4 from a radius of 10
         um to a_r = 54.4 um and (a_r / a)^4.37 to 1000 um. L = 0.4 m up to 7.5 m/s, 0.4 + 0.115 (U - 7.5) above. Hall
         (1989), J. Acoust. Soc. Am. 86, 1103, doi:10.1121/1.398102; Novarini, Keiffer and Norton (1998), IEEE J. Oceanic

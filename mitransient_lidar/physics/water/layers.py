@@ -137,17 +137,10 @@ class WaterColumn:
     def optical_depth(self, depth0: npt.ArrayLike, depth1: npt.ArrayLike, distance: npt.ArrayLike) -> FloatArray:
         """Optical depth of straight segments.
 
-        Parameters
-        ----------
-        depth0, depth1 : array_like
-            Depths of the two ends [m], in any order.
-        distance : array_like
-            Length of the segment [m], at least abs(depth1 - depth0).
+        `depth0`, `depth1`: depths of the two ends [m], in any order. `distance`: length of the segment [m], at least
+        abs(depth1 - depth0).
 
-        Returns
-        -------
-        ndarray
-            Optical depth, in the broadcast shape. A horizontal segment lies in the layer that owns its depth.
+        Result: optical depth, in the broadcast shape. A horizontal segment lies in the layer that owns its depth.
         """
         z0, z1, length = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (depth0, depth1, distance)))
         upper, lower = np.minimum(z0, z1), np.maximum(z0, z1)

@@ -77,22 +77,11 @@ _BISECTIONS = 52
 def fournier_forand(theta: ArrayLike, n: float, mu: float) -> FloatArray:
     """Fournier-Forand phase function.
 
-    Parameters
-    ----------
-    theta : array_like
-        Scattering angle [rad], 0 to pi.
-    n : float
-        Real refractive index of the particles relative to water, above 1.
-    mu : float
-        Slope of the hyperbolic (Junge) size distribution, 3 < mu < 5.
+    `theta`: scattering angle [rad], 0 to pi. `n`: real refractive index of the particles relative to water, above 1.
+    `mu`: slope of the hyperbolic (Junge) size distribution, 3 < mu < 5.
 
-    Returns
-    -------
-    ndarray
-        Phase function [1/sr], in the shape of `theta`; infinite at theta = 0.
+    Result: phase function [1/sr], in the shape of `theta`; infinite at theta = 0.
 
-    Notes
-    -----
     Fournier and Forand (1994), Ocean Optics XII, Proc. SPIE 2258, 194, in the form of Fournier and Jonasz (1999),
     Proc. SPIE 3761, 62. Near delta = 1 (theta about 10 degrees) both numerators vanish to second order and are replaced
     by binomial series in delta - 1.
@@ -143,13 +132,8 @@ def fournier_forand_parameters(backscatter_ratio: float) -> tuple[float, float]:
 
     `backscatter_ratio`: bb/b, from 3.4e-8 to 0.4999, the range of slopes mu from 3.0001 to 4.9999.
 
-    Returns
-    -------
-    n, mu : float
-        Parameters for `fournier_forand`, on the line n = 1.01 + 0.1542 (mu - 3).
+    Returns `n`, `mu`: parameters for `fournier_forand`, on the line n = 1.01 + 0.1542 (mu - 3).
 
-    Notes
-    -----
     The line comes from Mobley, Sundman and Boss (2002), Appl. Opt. 41, 1035, doi:10.1364/AO.41.001035.
     """
 
@@ -180,8 +164,6 @@ def petzold_average_particle() -> PhaseFunction:
     Returns the function from angles [rad] to p [1/sr], normalised to 1. Between the tabulated angles ln p is linear in
     ln theta; below 0.1 degree p ~ theta^-1.346.
 
-    Notes
-    -----
     Table 2 in Mobley et al. (1993), Appl. Opt. 32, 7484, doi:10.1364/AO.32.007484, derived from Petzold (1972), SIO
     Ref. 72-78. With this interpolation the raw table integrates to 0.9929, by which it is divided. The mean cosine is
     0.9241 and bb/b = 0.01826; linear interpolation of p, as in the paper, integrates to 1.0200 instead.
@@ -249,8 +231,6 @@ def petzold_water(name: str) -> PhaseFunction:
     Catalina, California), ``turbid`` (NUC 2040, San Diego harbour), or another station: ``autec_7``, ``autec_9``,
     ``haoce_5`` (Avalon Cove, Catalina), ``nuc_2200`` or ``nuc_2240``.
 
-    Notes
-    -----
     Petzold (1972), Volume scattering functions for selected ocean waters, Scripps Institution of Oceanography, SIO Ref.
     72-78, measured in green light (a 75 nm band about 514 nm). Molecules and particles were measured together: do not
     add scattering by sea water. There are no measurements below 0.17 degree, in the harbour below 0.09, where the

@@ -231,8 +231,7 @@ def _angle(s: npt.ArrayLike) -> FloatArray:
     return np.asarray(2 * np.arcsin(np.sqrt(np.minimum(s, 1))))
 
 
-#: Nodes of the fine table: 822 in the backward hemisphere, more than measurements have there.
-_COUNT = 32768
+_COUNT = 32768  #: Nodes of the fine table: 822 in the backward hemisphere, more than measurements have there.
 
 _FEWEST_ANGLES = 10
 _SMALLEST_LAST_DEG = 170.0
@@ -261,8 +260,6 @@ def read_phase_table(path: str | PathLike[str]) -> PhaseOfFile:
     rad if its heading says so, increasing within 0 to 180 degrees, at least 10 with any spacing, the last 170 or more.
     The value is positive, in 1/sr or any other unit per solid angle (such as a volume scattering function).
 
-    Notes
-    -----
     Between the angles ln p is linear in ln theta, as for `phase.petzold_average_particle`. Below the first angle the
     power law through the first two continues, or p is constant where the power law would decrease towards 0. If the
     first angle is 0, ln p is linear in theta^2 up to the second: flat at 0. Beyond the last angle p is constant. The

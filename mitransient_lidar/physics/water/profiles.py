@@ -63,11 +63,8 @@ _OTHER_QUANTITIES = frozenset(
     }
 )
 
-#: Tolerance, relative to c, of more than two given properties, for rounded decimals.
-_DISAGREEMENT = 0.02
-
-#: Bisections for the end of a layer that crosses a node.
-_BISECTIONS = 20
+_DISAGREEMENT = 0.02  #: Tolerance, relative to c, of more than two given properties, for rounded decimals.
+_BISECTIONS = 20  #: Bisections for the end of a layer that crosses a node.
 
 _Columns = dict[str, FloatArray]
 
@@ -125,20 +122,13 @@ class Profile:
         change monotonically this gives the least number of layers: ln(q_2/q_1) / ln(1 + 2 tolerance) from q_1 to q_2.
         Other properties need a few percent more.
 
-        Parameters
-        ----------
-        tolerance : float
-            Largest relative deviation, 1e-5 to 0.5.
+        `tolerance`: largest relative deviation, 1e-5 to 0.5.
 
-        Returns
-        -------
-        WaterColumn
-            At every depth attenuation, scattering and backscattering each deviate from the profile by at most
-            `tolerance` times the profile's value there. Where `COEFFICIENT_FLOOR` (`BACKSCATTERING_FLOOR`) is larger,
-            it replaces this value. Layers with the least thickness `THINNEST_LAYER` are exceptions. Vertical optical
-            depths from z = 0 are exact at the edges; within a layer they deviate by at most `tolerance`/2 times the
-            layer's own optical depth. The last layer, which has no lower edge, begins where the profile becomes
-            constant.
+        Result: at every depth attenuation, scattering and backscattering each deviate from the profile by at most
+        `tolerance` times the profile's value there. Where `COEFFICIENT_FLOOR` (`BACKSCATTERING_FLOOR`) is larger, it
+        replaces this value. Layers with the least thickness `THINNEST_LAYER` are exceptions. Vertical optical depths
+        from z = 0 are exact at the edges; within a layer they deviate by at most `tolerance`/2 times the layer's own
+        optical depth. The last layer, which has no lower edge, begins where the profile becomes constant.
         """
         tolerance = in_range("tolerance", tolerance, 1e-5, 0.5)
         z, (a, b, bb) = self._varying_part()

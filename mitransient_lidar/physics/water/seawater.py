@@ -38,22 +38,11 @@ _RESONANCES = (
 def refractive_index(wavelength_nm: ArrayLike, temperature: ArrayLike = 20.0, salinity: ArrayLike = 35.0) -> FloatArray:
     """Refractive index of sea water relative to air.
 
-    Parameters
-    ----------
-    wavelength_nm : array_like
-        Wavelength [nm], 400 to 1100.
-    temperature : array_like
-        Temperature [degrees C], 0 to 30.
-    salinity : array_like
-        Salinity [per mille], 0 to 40.
+    `wavelength_nm`: wavelength [nm], 400 to 1100. `temperature`: temperature [degrees C], 0 to 30. `salinity`: salinity
+    [per mille], 0 to 40.
 
-    Returns
-    -------
-    ndarray
-        Index [1], in the broadcast shape.
+    Result: index [1], in the broadcast shape.
 
-    Notes
-    -----
     Up to 700 nm Quan and Fry (1995), Appl. Opt. 34, 3477, doi:10.1364/AO.34.003477. Beyond, their formula is not valid:
     at 1064 nm its index for pure water is 0.001 too high, and its group index 0.005 too low. There pure water at 20
     degrees C has Daimon and Masumura's index (2007), Appl. Opt. 46, 3811, doi:10.1364/AO.46.003811, valid to 1129 nm,
@@ -69,16 +58,10 @@ def refractive_index(wavelength_nm: ArrayLike, temperature: ArrayLike = 20.0, sa
 def group_index(wavelength_nm: ArrayLike, temperature: ArrayLike = 20.0, salinity: ArrayLike = 35.0) -> FloatArray:
     """Group index of sea water relative to air, which determines travel times.
 
-    Parameters
-    ----------
-    wavelength_nm, temperature, salinity : array_like
-        As in `refractive_index`.
+    `wavelength_nm`, `temperature`, `salinity`: as in `refractive_index`.
 
-    Returns
-    -------
-    ndarray
-        n - wavelength dn/dwavelength [1], in the broadcast shape, with the derivative of the same formulas. Travel
-        times are too short by 0.03 % in all media alike, since air has the index 1 here.
+    Result: n - wavelength dn/dwavelength [1], in the broadcast shape, with the derivative of the same formulas. Travel
+    times are too short by 0.03 % in all media alike, since air has the index 1 here.
     """
     lam, t, s = _state(wavelength_nm, temperature, salinity)
     visible = _quan_fry(lam, t, s) - lam * _quan_fry_slope(lam, t, s)
@@ -96,8 +79,6 @@ def water_absorption(wavelength_nm: ArrayLike) -> FloatArray:
 
     `wavelength_nm`: wavelength [nm], 400 to 1100.
 
-    Notes
-    -----
     Up to 700 nm Table 3 in Pope and Fry (1997), Appl. Opt. 36, 8710, doi:10.1364/AO.36.008710, measured at 22 degrees
     C. From 705 nm Kou, Labrie and Chylek (1993), Appl. Opt. 32, 3531, doi:10.1364/AO.32.003531: 14.4 1/m at 1064 nm,
     like Kedenburg et al. (2012), doi:10.1364/OME.2.001588; Segelstein's compilation (1981) has 15.1 1/m. At 700 nm
@@ -124,8 +105,6 @@ def water_scattering(
     `wavelength_nm`, `temperature`, `salinity`: as in `refractive_index`. `depolarisation`: depolarisation ratio, 0 to
     0.2.
 
-    Notes
-    -----
     Zhang, Hu and He (2009), Opt. Express 17, 5698, doi:10.1364/OE.17.005698: density and salt concentration
     fluctuations, with UNESCO's equation of state (1981) and the `refractive_index` relative to vacuum. Beyond 700 nm no
     measurements confirm it; 1.1e-4 1/m at 1064 nm does not matter beside the absorption.

@@ -28,8 +28,7 @@ _TABLES = {
 }
 BOTTOMS = tuple(name for names in _TABLES.values() for name in names)
 
-#: Halvings of the albedo range that leave the rounding error.
-_BISECTIONS = 52
+_BISECTIONS = 52  #: Halvings of the albedo range that leave the rounding error.
 
 #: Incidences at which energy is checked [deg]: the reflectance grows towards the horizon.
 _CHECKED_DEG = (0.0, 45.0, 70.0, 80.0, 88.0)
@@ -143,22 +142,12 @@ def bottom_reflectance(name: str, value: object, wavelength_nm: float = 532.0) -
 
     Raises UserError if the value is none of these, or a number lies outside its range.
 
-    Parameters
-    ----------
-    name
-        Name of the parameter, for messages.
-    value
-        Number from 0 to 1, or its text, or one of `BOTTOMS`.
-    wavelength_nm
-        Wavelength for a bottom by name [nm], 400 to 700 for coral sand and algae, 400 to 1100 for the others.
+    `name`: name of the parameter, for messages. `value`: number from 0 to 1, or its text, or one of `BOTTOMS`.
+    `wavelength_nm`: wavelength for a bottom by name [nm], 400 to 700 for coral sand and algae, 400 to 1100 for the
+    others.
 
-    Returns
-    -------
-    float
-        Reflectance, 0 to 1; for a name linear between the values of the table, 10 nm apart.
+    Result: reflectance, 0 to 1; for a name linear between the values of the table, 10 nm apart.
 
-    Notes
-    -----
     Irradiance reflectance of clean coral sand, the green alga Boodlea, brown algae (mean of Turbinaria and Sargassum)
     and red algae (mean of Porolithon and Corallinaceae), from figure 6 in Maritorena, Morel and Gentili (1994), Limnol.
     Oceanogr. 39, 1689, doi:10.4319/lo.1994.39.7.1689. Dry and wet sand from one beach, an old asphalt road, a light

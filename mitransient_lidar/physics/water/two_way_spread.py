@@ -19,17 +19,14 @@ from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 
-#: Least downward component of a direction: light that is more nearly level leaves beam and view.
-_LEVEL = 0.01
+_LEVEL = 0.01  #: Least downward component of a direction: light that is more nearly level leaves beam and view.
 
-#: Largest number of events of a way.
-_MOST_EVENTS = 200
+_MOST_EVENTS = 200  #: Largest number of events of a way.
 
 #: Ways, and pairs of them, for each path: paths are sorted by displacement, and one stands for its neighbours.
 _WAYS, _PAIRS = 16, 8
 
-#: Least scattering coefficient, so that optical depths increase strictly [1/m].
-_LEAST_SCATTERING = 1e-12
+_LEAST_SCATTERING = 1e-12  #: Least scattering coefficient, so that optical depths increase strictly [1/m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +60,9 @@ class TwoWaySpread:
     ) -> TwoWaySpread:
         """Draw paths, the same ones for the same arguments.
 
-        Parameters
-        ----------
-        column, phases
-            Layers of water, and the phase function of each.
-        depths
-            Depths [m], increasing, positive, shape (depths,).
-        cos_water
-            Cosine of the axis in the water from the vertical, above 0 to 1.
-        paths
-            Number of paths for each depth.
-        seed
-            Seed of the random numbers.
+        `column`, `phases`: layers of water, and the phase function of each. `depths`: depths [m], increasing, positive,
+        shape (depths,). `cos_water`: cosine of the axis in the water from the vertical, above 0 to 1. `paths`: number
+        of paths for each depth. `seed`: seed of the random numbers.
         """
         rng = np.random.default_rng(seed)
         ways = _Ways(column, phases, depths, cos_water, _WAYS * paths, rng)
@@ -118,16 +106,10 @@ class TwoWaySpread:
 class _Ways:
     """Ways down from the surface along a tilted axis, all with an event above the last depth.
 
-    Attributes
-    ----------
-    share
-        Share of the light that meets an event above the last depth.
-    unscattered
-        Share of the light that has met none at each depth, shape (depths,).
-    values
-        Displacement x, y [m], excess length [m], excess absorption, direction x, y, z and number of events of ways at
-        each depth, shape (depths, 8, ways + 1). The number is 0 for ways that go up before it, and the last way is
-        straight.
+    `share`: share of the light that meets an event above the last depth. `unscattered`: share of the light that has met
+    none at each depth, shape (depths,). `values`: displacement x, y [m], excess length [m], excess absorption,
+    direction x, y, z and number of events of ways at each depth, shape (depths, 8, ways + 1). The number is 0 for ways
+    that go up before it, and the last way is straight.
     """
 
     def __init__(
@@ -222,14 +204,9 @@ def _turned(direction: FloatArray, theta: FloatArray, rng: np.random.Generator) 
     return np.asarray(turned / np.linalg.norm(turned, axis=0))
 
 
-#: Nodes in the inverse of a phase function's distribution.
-_NODES = 8192
-
-#: Scattering by more is loss: the light has left the beam [rad].
-LARGEST_ANGLE = np.radians(80.0)
-
-#: Displacement in place of displacements by larger angles [m].
-_FAR = 1e6
+_NODES = 8192  #: Nodes in the inverse of a phase function's distribution.
+LARGEST_ANGLE = np.radians(80.0)  #: Scattering by more is loss: the light has left the beam [rad].
+_FAR = 1e6  #: Displacement in place of displacements by larger angles [m].
 
 
 def scattering_angles(phase: PowerLawTable, u: FloatArray) -> FloatArray:
@@ -248,24 +225,11 @@ def displacements(
 ) -> np.ndarray:
     """Return displacements at depths by 0, 1, ... forward scattering events on a vertical way, as complex numbers [m].
 
-    Parameters
-    ----------
-    column, phases
-        Water layers, and the phase function of each.
-    depths
-        Depths [m], shape (depths,), positive.
-    most
-        Largest number of events.
-    count
-        Number of samples.
-    rng
-        Random numbers.
+    `column`, `phases`: water layers, and the phase function of each. `depths`: depths [m], shape (depths,), positive.
+    `most`: largest number of events. `count`: number of samples. `rng`: random numbers.
 
-    Returns
-    -------
-    ndarray
-        Shape (depths, most + 1, count). Events are at random optical depths of scattering. Angles above 80 degrees move
-        light out of any beam.
+    Result: shape (depths, most + 1, count). Events are at random optical depths of scattering. Angles above 80 degrees
+    move light out of any beam.
     """
     found = np.zeros((depths.size, most + 1, count), np.complex128)
     tops = np.append(column.layer_tops, np.inf)

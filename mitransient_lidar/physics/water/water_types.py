@@ -15,17 +15,11 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.water import COEFFICIENTS, LAYERED_WATER, WATER_KINDS
 from mitransient_lidar.core.validation import in_range, non_negative, positive
+from mitransient_lidar.physics.water import seawater
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import PETZOLD_WATERS, petzold_water, read_columns
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
-from mitransient_lidar.physics.water.seawater import (
-    VISIBLE_RANGE,
-    WAVELENGTH_RANGE,
-    group_index,
-    refractive_index,
-    water_absorption,
-    water_scattering,
-)
+from mitransient_lidar.physics.water.seawater import water_scattering
 
 _CHLOROPHYLL_RANGE = (0.01, 30.0)  # mg/m^3, in the Case 1 model
 _SECCHI_RANGE = (0.5, 25.0)  # m; above about 30 m the rules give less absorption than pure water has
@@ -39,17 +33,13 @@ GREEN_RANGE = (531.0, 533.0)
 #: Wavelengths [nm] at which Petzold's waters are used: from the centre of his filter to the usual laser.
 _PETZOLD_RANGE = (514.0, GREEN_RANGE[1])
 
-#: Decay of the absorption by dissolved matter with the wavelength [1/nm].
-_DISSOLVED_SLOPE = 0.014
-
-#: Nodes of the table that integrates a measured phase function; 822 lie in the backward hemisphere.
-_NODES = 32768
+_DISSOLVED_SLOPE = 0.014  #: Decay of the absorption by dissolved matter with the wavelength [1/nm].
+_NODES = 32768  #: Nodes of the table that integrates a measured phase function; 822 lie in the backward hemisphere.
 
 #: b, bb and the scattering by molecules bw [1/m].
 Scattered = tuple[float, float, float]
 
-#: bb/b of particles in the open ocean (Westberry et al. 2010).
-_OCEANIC_BACKSCATTER_RATIO = 0.010
+_OCEANIC_BACKSCATTER_RATIO = 0.010  #: bb/b of particles in the open ocean (Westberry et al. 2010).
 
 #: Diffuse attenuation Kd, and scattering where it was measured [1/m], by Jerlov's types.
 _JERLOV: dict[str, tuple[float, float | None]] = {
@@ -133,26 +123,17 @@ def pure_seawater(
     `wavelength_nm`, `temperature`, `salinity`: as in `seawater.water_scattering`: [nm], [degrees C], [per mille].
     """
     b = float(water_scattering(wavelength_nm, temperature, salinity))
-    return InherentProperties(float(water_absorption(wavelength_nm)), b, b / 2, b)
+    return InherentProperties(float(seawater.water_absorption(wavelength_nm)), b, b / 2, b)
 
 
 def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
     """Water with one of Jerlov's optical types at 532 nm, with Jerlov's Kd.
 
-    Parameters
-    ----------
-    water_type : str
-        I, IA, IB, II or III in the open ocean, 1C, 3C, 5C, 7C or 9C at the coast.
-    wavelength_nm : float
-        Wavelength [nm], 531 to 533: the table is for 532 nm only.
+    `water_type`: I, IA, IB, II or III in the open ocean, 1C, 3C, 5C, 7C or 9C at the coast. `wavelength_nm`: wavelength
+    [nm], 531 to 533: the table is for 532 nm only.
 
-    Raises
-    ------
-    UserError
-        If there is no such type.
+    Raises `UserError` if there is no such type.
 
-    Notes
-    -----
     Kd: Jerlov (1976), Marine Optics, Table XXVII. Scattering in IB to 5C: measurements compiled by Williamson and
     Hollins (2022), Appl. Opt. 61, 9951; in 7C and 9C: Solonenko and Mobley (2015), Appl. Opt. 54, 5392,
     doi:10.1364/AO.54.005392, who derived it from Kd. No source gives the backscattering. In types IB to III the
@@ -186,15 +167,8 @@ def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
 def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentProperties:
     """Case 1 water (open ocean), whose particles and dissolved matter covary with chlorophyll.
 
-    Parameters
-    ----------
-    concentration : float
-        Chlorophyll concentration C [mg/m^3], 0.01 to 30.
-    wavelength_nm : float
-        Wavelength [nm], 400 to 700.
+    `concentration`: chlorophyll concentration C [mg/m^3], 0.01 to 30. `wavelength_nm`: wavelength [nm], 400 to 700.
 
-    Notes
-    -----
     Diffuse attenuation: Kd = aw + bw/2 + chi C^e by Morel and Maritorena (2001), J. Geophys. Res. 106, 7163,
     doi:10.1029/2000JC000319. Particles: b_p = 0.416 C^0.766 (wavelength/550)^v by Loisel and Morel (1998), Limnol.
     Oceanogr. 43, 847, doi:10.4319/lo.1998.43.5.0847, with v = (lg C - 0.3)/2 below 2 mg/m^3 and 0 above, and
@@ -203,7 +177,7 @@ def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentP
     of 2.
     """
     c = in_range("concentration", concentration, *_CHLOROPHYLL_RANGE)
-    lam = in_range("wavelength_nm", wavelength_nm, *VISIBLE_RANGE)
+    lam = in_range("wavelength_nm", wavelength_nm, *seawater.VISIBLE_RANGE)
     water = pure_seawater(lam)
     kw, factor, exponent = _case1_terms(lam)
 
@@ -222,17 +196,15 @@ def near_infrared(green: InherentProperties, wavelength_nm: float) -> InherentPr
 
     `green`: the water at 532 nm. `wavelength_nm`: wavelength [nm], above 700 to 1100.
 
-    Notes
-    -----
     The absorption has two parts. `water_absorption` gives at least 0.62 1/m. The excess over pure water at 532 nm
     decreases by exp(-0.014 (wavelength - 532)), as for dissolved matter (Bricaud, Morel and Prieur 1981, Limnol.
     Oceanogr. 26, 43, doi:10.4319/lo.1981.26.1.0043); a ten thousandth is left at 1064 nm. Scattering and backscattering
     by particles are proportional to 1/wavelength (Gordon and Morel 1983); exponents in real waters lie between 0 and 2.
     At 1064 nm this scattering is a hundredth of the attenuation.
     """
-    lam = in_range("wavelength_nm", wavelength_nm, VISIBLE_RANGE[1], WAVELENGTH_RANGE[1])
+    lam = in_range("wavelength_nm", wavelength_nm, seawater.VISIBLE_RANGE[1], seawater.WAVELENGTH_RANGE[1])
     ratio, pure, molecules = 532.0 / lam, pure_seawater(), green.water_scattering
-    found = pure_seawater(lam) if molecules > 0 else InherentProperties(float(water_absorption(lam)), 0.0, 0.0)
+    found = pure_seawater(lam) if molecules > 0 else InherentProperties(float(seawater.water_absorption(lam)), 0.0, 0.0)
     other = max(green.absorption - pure.absorption, 0.0) * np.exp(-_DISSOLVED_SLOPE * (lam - 532.0))
     particles, back = max(green.scattering - molecules, 0.0), max(green.backscattering - molecules / 2, 0.0)
     return InherentProperties(
@@ -256,8 +228,11 @@ def default_water(wavelength_nm: float) -> dict[str, float]:
     These are ``refractive_index`` and ``group_index`` of sea water, 400 to 1100 nm. Above 700 nm they include
     ``attenuation``, ``scattering`` and ``backscattering`` [1/m] of the default 532 nm water (`near_infrared`).
     """
-    found = {"refractive_index": refractive_index(wavelength_nm), "group_index": group_index(wavelength_nm)}
-    if wavelength_nm > VISIBLE_RANGE[1]:
+    found = {
+        "refractive_index": seawater.refractive_index(wavelength_nm),
+        "group_index": seawater.group_index(wavelength_nm),
+    }
+    if wavelength_nm > seawater.VISIBLE_RANGE[1]:
         c, b, bb = (LAYERED_WATER[name].default for name in COEFFICIENTS)
         water = near_infrared(InherentProperties(c - b, b, bb), wavelength_nm)
         found |= {name: getattr(water, name) for name in COEFFICIENTS}
@@ -269,8 +244,6 @@ def from_kd(kd: float) -> InherentProperties:
 
     `kd`: diffuse attenuation coefficient of downwelling irradiance [1/m], 0.0486 (Jerlov I) to 0.738 (Jerlov 9C).
 
-    Notes
-    -----
     Albedo and bb/b are linear in ln Kd between the `jerlov` values, so that Kd = 0.0796 gives jerlov("II"). Absorption
     follows from `InherentProperties.kd`. It has an error of about 15 %, and scattering a factor of 2: at Kd = 0.08 the
     two sources of `jerlov` have 0.18 and 0.38 1/m.
@@ -300,8 +273,6 @@ def from_secchi(depth: float) -> InherentProperties:
 
     `depth`: Secchi depth z [m], 0.5 to 25.
 
-    Notes
-    -----
     Kd = 1.7/z by Poole and Atkins (1929), J. Mar. Biol. Assoc. 16, 297, and c + Kd = 8.7/z by Tyler (1968), Limnol.
     Oceanogr. 13, 1, doi:10.4319/lo.1968.13.1.0001; absorption then follows from `InherentProperties.kd`. In turbid
     coastal water Holmes (1970), Limnol. Oceanogr. 15, 688, found 1.44 and 9.42; the first constant was 1.2 to 3 in
@@ -349,7 +320,7 @@ def water_of(
         return pure_seawater(wavelength_nm, temperature, salinity)
     if value is None:
         raise UserError(f"value is missing: {kind} needs one")
-    if wavelength_nm > VISIBLE_RANGE[1]:
+    if wavelength_nm > seawater.VISIBLE_RANGE[1]:
         return near_infrared(water_of(kind, value), wavelength_nm)
     text = value
     if kind == "jerlov":

@@ -43,10 +43,9 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
     For a shot series it is the mean, with the mean's standard error. The waveform's attribute ``units`` is W, V or 1,
     and its ``long_name`` belongs to the variable shown.
 
-    Raises UserError if it has another shape, no pixel angles, or attributes or times that are invalid.
-
-    `dataset`: a result with ``waveform``, or a record with ``signal``, over (pixel, time) or (row, column, time), after
-    ``shot`` if it has shots.
+    Raises UserError if it has another shape, no pixel angles, or attributes or times that are invalid. `dataset`: a
+    result with ``waveform``, or a record with ``signal``, over (pixel, time) or (row, column, time), after ``shot`` if
+    it has shots.
     """
     name = next(name for name in RECORDS if name in dataset)
     dims = record_dims(dataset, name, shots=True)
@@ -106,9 +105,7 @@ _SIGHTS = ("surface_time", "depth_per_ns")  # coordinates of `geometry.LinesOfSi
 _WAVEFORMS = ("waveform", "waveform_stderr")
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
 _STRIP_ASPECT = 4.0  # at most, of pixels drawn side by side
-
-#: Most numbers that are embedded exactly.
-_EXACT = 400_000
+_EXACT = 400_000  #: Most numbers that are embedded exactly.
 
 #: Binary digits kept of values without errors, of errors, and of values per error.
 _VALUE_BITS, _ERROR_BITS, _BITS_PER_ERROR = 12, 5, 3
@@ -136,25 +133,15 @@ def page_text(stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: flo
     the errors.
 
     Raises UserError if `stack` has neither gates nor a record in time, `result` has other pixels, or `limit_mb` is not
-    above 0 or too small for the gates of one block (of all pixels, if they form no image).
-
-    Parameters
-    ----------
-    stack : xarray.Dataset
-        A result with ``waveform`` [W], or a record with ``signal``, over (pixel, time) or (row, column, time); the map
-        shows one of its time bins. For a shot series, the page shows the mean. Pixels with outlines
-        (``pixel_outlines``) have their shapes.
-
-        Or camera frames, whose mean above the dark level the page shows, or a gate stack: ``gate_energy`` and
-        ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the coordinates ``gate_start`` and
-        ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the surface echo time is known, ``gate_depth``
-        [m]. With a result's lines of sight, pixel depths are along them; gate and time depths are on the receiver's
-        axis.
-    result : xarray.Dataset, optional
-        A render of the same pixels, whose ``waveform`` [W] is plotted; by default `stack` itself. Without waveforms a
-        pixel's record is its energy in the gates.
-    limit_mb : float
-        Largest page size [MB of 1e6 bytes], above 0.
+    above 0 or too small for the gates of one block (of all pixels, if they form no image). `stack`: a result with
+    ``waveform`` [W], or a record with ``signal``, over (pixel, time) or (row, column, time); the map shows one of its
+    time bins. For a shot series, the page shows the mean. Pixels with outlines (``pixel_outlines``) have their shapes.
+    Or camera frames, whose mean above the dark level the page shows, or a gate stack: ``gate_energy`` and
+    ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the coordinates ``gate_start`` and
+    ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the surface echo time is known, ``gate_depth`` [m].
+    With a result's lines of sight, pixel depths are along them; gate and time depths are on the receiver's axis.
+    `result`: a render of the same pixels, whose ``waveform`` [W] is plotted; by default `stack` itself. Without
+    waveforms a pixel's record is its energy in the gates. `limit_mb`: largest page size [MB of 1e6 bytes], above 0.
     """
     positive("limit_mb", limit_mb)
     record: xr.Dataset | None

@@ -24,12 +24,8 @@ def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_
     """Draw the depth of the strongest echo in every pixel, and its confidence, from `range_images.depth_image`.
 
     `dataset`: a gate stack with the coordinate ``gate_depth``. `path`: file to write. `from_depth`: leave out gates
-    whose middle is shallower on the axis [m]; by default gates that open before the surface echo's end.
-
-    Raises
-    ------
-    UserError
-        If the dataset is no gate stack, has no depths, or fewer than three gates are left.
+    whose middle is shallower on the axis [m]; by default gates that open before the surface echo's end. Raises
+    `UserError` if the dataset is no gate stack, has no depths, or fewer than three gates are left.
     """
     figure = drawing.new_figure(path, 9.6, 4.3)
     stack = as_stack(dataset)

@@ -69,10 +69,7 @@ def plot_gates(dataset: xr.Dataset, path: drawing.FilePath | None = None, log: b
     surface (at its 99th percentile), so that the surface echo does not darken the rest. The colour bar label states the
     share of brighter values. With `log` the colour scale, or the energy axis, is logarithmic.
 
-    Raises
-    ------
-    UserError
-        If the dataset is no gate stack.
+    Raises `UserError` if the dataset is no gate stack.
     """
     figure = drawing.new_figure(path, 9.6, 4.6)
     stack = as_stack(dataset)
@@ -109,11 +106,8 @@ def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False
 
     The colours are as in `plot_gates`. The file name ends in ``.gif`` or ``.mp4``.
 
-    Raises
-    ------
-    UserError
-        If the dataset is no gate stack of an imager, the file has another suffix, ffmpeg is missing or fails, or the
-        file cannot be written.
+    Raises `UserError` if the dataset is no gate stack of an imager, the file has another suffix, ffmpeg is missing or
+    fails, or the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -314,8 +308,7 @@ def _draw_pixel_gates(figure: Figure, stack: xr.Dataset, *, log: bool) -> None:
 #: Share of the pixels that may be brighter than white, or darker than black: glints would leave the rest black.
 _CLIPPED = 0.01
 
-#: Smallest animation width [pixels].
-_ANIMATION_WIDTH = 384
+_ANIMATION_WIDTH = 384  #: Smallest animation width [pixels].
 
 
 def plot_passive(dataset: xr.Dataset, path: drawing.FilePath | None = None, frame: int = 0) -> Figure:
@@ -348,10 +341,7 @@ def plot_passive(dataset: xr.Dataset, path: drawing.FilePath | None = None, fram
 def animate_passive(dataset: xr.Dataset, path: drawing.FilePath) -> None:
     """Write an imager's frames, from `rendering.passive.render_passive`, as an endless GIF animation in real time.
 
-    Raises
-    ------
-    UserError
-        If the dataset has no frames or no image, or the file's name does not end in ``.gif``.
+    Raises `UserError` if the dataset has no frames or no image, or the file's name does not end in ``.gif``.
     """
     from PIL import Image
 

@@ -25,8 +25,7 @@ from mitransient_lidar.studies.publication.statements import Measured, Statement
 
 _LOG = logging.getLogger(__name__)
 
-#: File for the statements.
-TABLE = "statements.csv"
+TABLE = "statements.csv"  #: File for the statements.
 
 
 class _Figure(NamedTuple):
@@ -53,8 +52,7 @@ _FIGURES = {
     "fig16": _Figure(waveforms.layer_zoom, quantities.layer_durations),
 }
 
-#: Figure names.
-NAMES = tuple(_FIGURES)
+NAMES = tuple(_FIGURES)  #: Figure names.
 
 
 @dataclass(frozen=True)

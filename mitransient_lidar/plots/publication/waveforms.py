@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -19,25 +19,13 @@ from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.layout import draw_sea_level
 from mitransient_lidar.plots.studies.shots import draw_sea
 from mitransient_lidar.studies.publication import scenes
-from mitransient_lidar.studies.publication.scenes import (
-    FOUR,
-    LAYOUTS,
-    SHOTS,
-    Renders,
-    System,
-    as_series,
-    geometry_of,
-    outlines,
-    shot_places,
-    three_shots,
-)
+from mitransient_lidar.studies.publication.scenes import Renders
 from mitransient_lidar.studies.publication.statements import change
 from mitransient_lidar.studies.shots import render_found_shots
 
 DEPTH_LABEL = "depth on the axis (m)"
 
-#: Names of the pixel colours, for legends.
-PIXELS = ("red (0)", "green (1)", "blue (2)", "black (3)")
+PIXELS = ("red (0)", "green (1)", "blue (2)", "black (3)")  #: Names of the pixel colours, for legends.
 
 
 def draw_waveforms(
@@ -55,10 +43,10 @@ def draw_waveforms(
 
     `origin` selects the light from one origin, and `pixels` some pixels.
     """
-    series = as_series(result)
+    series = scenes.as_series(result)
     power = series.parts[origin] if origin else series.power
     mean, error = power.mean(axis=0), power.std(axis=0, ddof=1) / np.sqrt(len(power))
-    depth = geometry_of(result).depth_of_time(series.time)
+    depth = scenes.geometry_of(result).depth_of_time(series.time)
     shown = (depth >= limits[0]) & (depth <= limits[1])
     factor, prefix = drawing.si_prefix(float(series.power.mean(axis=0)[:, shown].max()))
     styles = palette.curves(len(mean))
@@ -129,7 +117,7 @@ def layer_zoom(renders: Renders) -> Figure:
     figure = _four_and_one(renders, (scenes.LAYERED_FOUR, scenes.LAYERED_SINGLE), (1.8, 5.0), "16", log=True)
     for ax, scene in zip(figure.axes, (scenes.LAYERED_FOUR, scenes.LAYERED_SINGLE), strict=True):
         result = renders.shot(scene)
-        mean, geometry = as_series(result).mean(), geometry_of(result)
+        mean, geometry = scenes.as_series(result).mean(), scenes.geometry_of(result)
         factor, _ = drawing.si_prefix(float(mean.power[:, geometry.depth_of_time(mean.time) >= 1.8].max()))
         colours = palette.pixel_colours(len(mean.power))
         for pixel, middle in enumerate(scenes.layer_times(result)):
@@ -189,6 +177,7 @@ def add_pixel_legend(ax: Axes, loc: Literal["best", "upper left"] = "best") -> N
 
 
 _STYLES = ("-", "--", ":")
+_SECTION: dict[str, Any] = {"hide": ("top", "right"), "xlabel": "x (m)", "ylabel": "z (m)", "aspect": "equal"}
 
 
 def surface_echoes(renders: Renders) -> Figure:
@@ -196,7 +185,7 @@ def surface_echoes(renders: Renders) -> Figure:
     figure = drawing.new_figure(None, 10.4, 6.2)
     axes = figure.subplots(2, 3)
     _draw_places(renders, axes[0], "10")
-    for ax, result, panel in zip(axes[1], three_shots(renders), "bcd", strict=True):
+    for ax, result, panel in zip(axes[1], scenes.three_shots(renders), "bcd", strict=True):
         draw_waveforms(ax, result, (-1.2, 1.2))
         ax.set_title(f"10 ({panel})  surface echo, shot {'bcd'.index(panel) + 1}", fontsize="medium")
     add_pixel_legend(axes[1, 0], "upper left")
@@ -209,7 +198,7 @@ def bottom_echoes(renders: Renders) -> Figure:
     grid = figure.add_gridspec(2, 3)
     _draw_places(renders, [figure.add_subplot(grid[0, number]) for number in range(3)], "11")
     ax = figure.add_subplot(grid[1, :])
-    results = three_shots(renders)
+    results = scenes.three_shots(renders)
     for number, (result, style) in enumerate(zip(results, _STYLES, strict=True), start=1):
         draw_waveforms(ax, result, (4.0, 6.5), pixels=[0], label=f"shot {number}", linestyle=style)
     ax.legend(frameon=False)
@@ -219,7 +208,7 @@ def bottom_echoes(renders: Renders) -> Figure:
 
 def paths(renders: Renders) -> Figure:
     """Draw the paths below the slopes of shots 1 and 3, refracted by Snell's law (figure 12)."""
-    system, places = System.of(SHOTS[0]), shot_places(renders)
+    system, places = scenes.System.of(scenes.SHOTS[0]), scenes.shot_places(renders)
     figure = drawing.new_figure(None, 7.0, 3.6)
     for ax, slope, name in zip(figure.subplots(1, 2), (places[0].along, places[2].along), "AB", strict=True):
         down = np.array([math.sin(system.off_nadir), -math.cos(system.off_nadir)])
@@ -232,18 +221,15 @@ def paths(renders: Renders) -> Figure:
         ax.plot([-2 * down[0], 0, end[0]], [-2 * down[1], 0, end[1]], color=palette.BEAM)
         ax.plot([0, 0], [0, -system.bottom_depth], color="0.6", linestyle=":")
         slope_deg, angle = math.degrees(math.atan(slope)), math.degrees(math.atan2(ray[0], -ray[1]))
-        ax.set_title(
-            f"12  shot {name}: slope {slope_deg:+.1f}°, in water {angle:.2f}°,\npath {path:.3f} m", fontsize="medium"
-        )
-        ax.set(xlabel="x (m)", ylabel="z (m)", xlim=(-2, 3), aspect="equal")
-        drawing.add_grid(ax, hide=("top", "right"))
+        title = f"12  shot {name}: slope {slope_deg:+.1f}°, in water {angle:.2f}°,\npath {path:.3f} m"
+        drawing.finish(ax, title, **_SECTION, xlim=(-2, 3))
     return figure
 
 
 def _draw_places(renders: Renders, axes: Sequence[Axes], number: str) -> None:
     """Draw the sea about each shot, with the footprints of beam and pixels."""
-    places = shot_places(renders)
-    drawn = render_found_shots(renders.session(SHOTS[0]), places, waveforms=False)
+    places = scenes.shot_places(renders)
+    drawn = render_found_shots(renders.session(scenes.SHOTS[0]), places, waveforms=False)
     for index, (ax, shot) in enumerate(zip(axes, places, strict=True)):
         draw_sea(ax, dataclasses.replace(drawn, shots=(shot,)), first=index + 1)
         # Adding 0 turns -0 into 0.
@@ -259,7 +245,7 @@ _HALF_SIDE, _AXES_APART = 1.3, 0.25
 
 def system(_renders: Renders) -> Figure:
     """Draw the lidar, beam and field of view in air and in water, in the incidence plane (figure 5)."""
-    numbers = System.of(FOUR)
+    numbers = scenes.System.of(scenes.FOUR)
     figure = drawing.new_figure(None, 8.0, 4.2)
     left, right = figure.subplots(1, 2)
     origin = np.array([-numbers.height * math.tan(numbers.off_nadir), 0.0, numbers.height])
@@ -289,9 +275,7 @@ def system(_renders: Renders) -> Figure:
     )
     for ax, title in ((left, "5  system in air"), (right, "5  sea, level, and bottom")):
         ax.axhline(0, color=palette.SEA, linewidth=2)
-        ax.set_title(title, fontsize="medium")
-        ax.set(xlabel="x (m)", ylabel="z (m)", aspect="equal")
-        drawing.add_grid(ax, hide=("top", "right"))
+        drawing.finish(ax, title, **_SECTION)
     right.axhline(-numbers.bottom_depth, color=palette.BOTTOM, linewidth=2)
     right.plot([], [], color=palette.BEAM, label="beam, e$^{-1/2}$")
     right.plot([], [], color=palette.VIEW, linestyle="--", label="field of view")
@@ -303,7 +287,7 @@ def mesh(renders: Renders) -> Figure:
     """Draw axes refracted at sea facets, and the sea's triangles with the footprints (figure 6)."""
     from mitransient_lidar.transport.scene_parts import seas_of
 
-    numbers, session = System.of(FOUR), renders.session(FOUR)
+    numbers, session = scenes.System.of(scenes.FOUR), renders.session(scenes.FOUR)
     sea = seas_of(session.scene)[0].sea
     figure = drawing.new_figure(None, 9.6, 4.6)
     left, right = figure.subplots(1, 2)
@@ -328,7 +312,7 @@ def mesh(renders: Renders) -> Figure:
     return figure
 
 
-def _draw_section(ax: Axes, numbers: System, lines: np.ndarray, heights: np.ndarray) -> None:
+def _draw_section(ax: Axes, numbers: scenes.System, lines: np.ndarray, heights: np.ndarray) -> None:
     """Draw a section of the sea along x, and parallel axes that its facets refract."""
     ax.plot(lines, heights, color=palette.SEA, linewidth=1.6)
     down = np.array([math.sin(numbers.off_nadir), -math.cos(numbers.off_nadir)])
@@ -340,16 +324,14 @@ def _draw_section(ax: Axes, numbers: System, lines: np.ndarray, heights: np.ndar
         end = point + 2.0 * refract(down, np.array([-slope, 1.0]), numbers.refractive_index)
         ax.plot([start[0], point[0]], [start[1], point[1]], color=palette.BEAM, linewidth=1)
         ax.plot([point[0], end[0]], [point[1], end[1]], color=palette.BEAM, linestyle="--", linewidth=1)
-    ax.set(xlabel="x (m)", ylabel="z (m)", aspect="equal")
-    ax.set_title("6 (a)  axes refracted by facets, section at y = 0", fontsize="medium")
-    drawing.add_grid(ax, hide=("top", "right"))
+    drawing.finish(ax, "6 (a)  axes refracted by facets, section at y = 0", **_SECTION)
 
 
 def pixels(renders: Renders) -> Figure:
     """Draw the pixels of the three layouts as seen from the lidar (figure 8)."""
     figure = drawing.new_figure(None, 8.4, 3.0)
-    for ax, scene, panel in zip(figure.subplots(1, 3), LAYOUTS, "abc", strict=True):
-        shapes = outlines(renders, scene)
+    for ax, scene, panel in zip(figure.subplots(1, 3), scenes.LAYOUTS, "abc", strict=True):
+        shapes = scenes.outlines(renders, scene)
         for number, (shape, colour) in enumerate(zip(shapes, palette.pixel_colours(len(shapes)), strict=True)):
             for line in shape:
                 # angle_y to the left, angle_x, away from nadir, up.

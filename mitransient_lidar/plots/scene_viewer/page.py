@@ -24,11 +24,8 @@ from mitransient_lidar.results.attributes import PointClass
 if TYPE_CHECKING:
     from mitransient_lidar.rendering.geometry import Bundle, Relief, SceneGeometry, Solid
 
-#: Rays drawn along a beam or pixel, and most boundaries of layers drawn.
-_RAYS, _MOST_LAYERS = 4, 12
-
-#: Most points of a flight that are drawn.
-_MOST_POINTS = 80_000
+_RAYS, _MOST_LAYERS = 4, 12  #: Rays drawn along a beam or pixel, and most boundaries of layers drawn.
+_MOST_POINTS = 80_000  #: Most points of a flight that are drawn.
 
 
 def scene_traces(geometry: SceneGeometry) -> Iterator[dict[str, Any]]:

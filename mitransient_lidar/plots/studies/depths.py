@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from mitransient_lidar.analysis.depth_uncertainty import SURVEY_ORDERS
 from mitransient_lidar.plots import drawing, palette
-from mitransient_lidar.plots.studies.panels import finish, name_sides, new_panels
+from mitransient_lidar.plots.drawing import finish, name_sides, new_panels
 
 #: Colours for the orders from the strictest on, for none, and for an unknown depth.
 _ORDER_COLOURS = (*palette.ordered(5), "0.9")
@@ -128,11 +128,8 @@ def _draw_order_map(figure: Figure, ax: Axes, x: Any, y: Any, orders: Any) -> No
     lost = len(_ORDER_COLOURS) - 1
     norm = BoundaryNorm(np.arange(lost + 2) - 0.5, lost + 1)
     shown = np.where(orders < 0, lost, orders)
-    bar = figure.colorbar(
-        ax.pcolormesh(x, y, shown, cmap=ListedColormap(_ORDER_COLOURS), norm=norm, rasterized=True),
-        ax=ax,
-        ticks=range(lost + 1),
-    )
+    drawn = ax.pcolormesh(x, y, shown, cmap=ListedColormap(_ORDER_COLOURS), norm=norm, rasterized=True)
+    bar = figure.colorbar(drawn, ax=ax, ticks=range(lost + 1))
     bar.ax.set_yticklabels(_NAMES)
 
 

@@ -13,10 +13,9 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from mitransient_lidar.physics.lidar.axis_limits import system_attenuation
 from mitransient_lidar.plots import drawing, palette
-from mitransient_lidar.plots.studies.panels import finish
+from mitransient_lidar.plots.drawing import finish
 
-#: Light share at which a panel's horizontal axis begins.
-_SMALLEST_SHARE = 3e-3
+_SMALLEST_SHARE = 3e-3  #: Light share at which a panel's horizontal axis begins.
 
 #: Panels: variable, its coordinate, label of that axis, and title.
 _PANELS = (

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mitransient_lidar.plots import drawing, palette
-from mitransient_lidar.plots.studies.panels import finish, new_panels
+from mitransient_lidar.plots.drawing import finish, new_panels
 
 _SHOWN = 20  # designs in a panel, the best ones
 _WIDE = 20.0  # largest over smallest ratio from which on the axis is logarithmic

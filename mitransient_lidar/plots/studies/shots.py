@@ -17,12 +17,11 @@ from matplotlib.patheffects import withStroke
 from mitransient_lidar.analysis.retrieval.retrieval_table import estimates, truth_statistics
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import drawing, palette
-from mitransient_lidar.plots.studies.panels import finish
+from mitransient_lidar.plots.drawing import finish
 from mitransient_lidar.rendering.shots.truth import Shot
 from mitransient_lidar.studies.shots import RenderedShots, depth_bias, slope_correlations, slope_effects
 
-#: Share of a pixel's peak that counts as an echo.
-_FAINT = 5e-3
+_FAINT = 5e-3  #: Share of a pixel's peak that counts as an echo.
 
 
 def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = None) -> Figure:
@@ -166,10 +165,9 @@ def plot_retrieval(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
         ax.errorbar(x, one.values, one.errors, fmt=".", color=palette.BLUE, markersize=5, linewidth=0.7)
         middle = float(np.mean(truth[np.isfinite(truth)])) if np.isfinite(truth).any() else 0.0
         ax.axline((middle if varied else 0.0, middle), slope=float(varied), color="0.5", linewidth=0.9)
-        ax.set(xlabel=label, ylabel=f"estimated {one.head}")
         ax.set_title(truth_statistics(one).partition(": ")[2].replace(", rms of", ",\nrms of"), fontsize="small")
         ax.locator_params(nbins=6)
-        drawing.add_grid(ax)
+        drawing.finish(ax, xlabel=label, ylabel=f"estimated {one.head}")
     bars = Line2D([], [], color=palette.BLUE, marker=".", label="estimates, ±1 standard error")
     line = Line2D([], [], color="0.5", linewidth=0.9, label="truth")
     figure.legend(handles=[bars, line], loc="outside lower center", ncols=2, frameon=False)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mitransient_lidar.plots import drawing, palette
-from mitransient_lidar.plots.studies.panels import finish
+from mitransient_lidar.plots.drawing import finish
 
 _DASHES = (0, (4, 2))
 _EVERY: dict[str, Any] = {"markevery": 0.1, "markersize": 4}

@@ -19,14 +19,10 @@ from mitransient_lidar.plugins.ocean_surface import SeaPatches
 from mitransient_lidar.rendering.accumulators import Light
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
+from mitransient_lidar.transport.light_maps import suitability
 from mitransient_lidar.transport.light_maps.maps import HeightFields
 from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
-from mitransient_lidar.transport.light_maps.suitability import (
-    REACH_THE_SURFACE,
-    UnsuitedError,
-    light_faintly,
-    over_water,
-)
+from mitransient_lidar.transport.light_maps.suitability import REACH_THE_SURFACE
 from mitransient_lidar.transport.medium.bubbles import BubblePlume
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import aligned
@@ -36,11 +32,8 @@ from mitransient_lidar.transport.probe import land_of_shots
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
 from mitransient_lidar.transport.solids import scene_of_shapes
 
-#: Paths of all shots in a launch, and time bins of all their pixels.
-_PATHS, _BINS = 2**17, 2**24
-
-#: Largest number of shots in a batch: their sea has 120 000 triangles a shot.
-_MOST_SHOTS = 64
+_PATHS, _BINS = 2**17, 2**24  #: Paths of all shots in a launch, and time bins of all their pixels.
+_MOST_SHOTS = 64  #: Largest number of shots in a batch: their sea has 120 000 triangles a shot.
 
 #: Memory per bin in a series, for mean and standard error of energy and power, and their copy in the result [bytes].
 _BYTES_PER_BIN = 64
@@ -219,22 +212,10 @@ class ShotBatches:
     and the patches lie beside each other in one mesh. Solids are met at the location itself, except solids that move
     with the lidar. A bubble plume belongs to one shot: such scenes have a batch for each.
 
-    Parameters
-    ----------
-    renderer
-        Renderer for the shot at the scene's location.
-    aim
-        Location (x, y) in the scene of its own shot [m].
-    passes
-        Passes for each shot, the most with a `goal`.
-    share
-        Share of a full pass's paths.
-    goal
-        Relative standard error of a batch's median bin that ends its passes.
-    window
-        Bins that count, for a shot without land; None where none do.
-    companions
-        Solids that move with the lidar.
+    `renderer`: renderer for the shot at the scene's location. `aim`: location (x, y) in the scene of its own shot [m].
+    `passes`: passes for each shot, the most with a `goal`. `share`: share of a full pass's paths. `goal`: relative
+    standard error of a batch's median bin that ends its passes. `window`: bins that count, for a shot without land;
+    None where none do. `companions`: solids that move with the lidar.
     """
 
     def __init__(
@@ -320,10 +301,7 @@ class ShotBatches:
             on_sea = all_shots.on_sea
             waves = on_sea.scene_part(lidar.mitsuba_scene, on_sea.places, self._aim)
             placed = replace(
-                lidar,
-                parts=tuple(moved),
-                receiver_poses=all_shots.receiver,
-                transmitter_poses=all_shots.transmitter,
+                lidar, parts=tuple(moved), receiver_poses=all_shots.receiver, transmitter_poses=all_shots.transmitter
             )
             fields = HeightFields.of_patches(values, corners, sea.cell_size, sea.wind_direction, waves, copies)
             return renderer.over(placed, fields)
@@ -416,15 +394,15 @@ def _errors(window: ErrorWindow | None, light: Light) -> FloatArray:
 def suits_maps(lidar: LidarScene, poses: ShotPoses) -> BoolArray:
     """Return which shots in a scene that suits light maps serve: over water, with faint light on targets."""
     places = poses.places - lidar.frame_origin[:2]
-    faint = [light_faintly(lidar, target, places, poses.turns) for target in lidar.targets]
-    return np.asarray(np.all([over_water(lidar, places, poses.turns), *faint], axis=0))
+    faint = [suitability.light_faintly(lidar, target, places, poses.turns) for target in lidar.targets]
+    return np.asarray(np.all([suitability.over_water(lidar, places, poses.turns), *faint], axis=0))
 
 
 def require_water(lidar: LidarScene, poses: ShotPoses) -> None:
     """Raise `UnsuitedError` if light maps do not suit shots, since they meet land, or solids near the surface."""
-    dry = ~over_water(lidar, poses.places - lidar.frame_origin[:2], poses.turns)
+    dry = ~suitability.over_water(lidar, poses.places - lidar.frame_origin[:2], poses.turns)
     if dry.any():
-        raise UnsuitedError(f"{REACH_THE_SURFACE} in {np.count_nonzero(dry)} shots")
+        raise suitability.UnsuitedError(f"{REACH_THE_SURFACE} in {np.count_nonzero(dry)} shots")
 
 
 def share_for_error(error: float) -> float:

@@ -1,9 +1,11 @@
-"""The loaded scene for a shot series: lidar, time bins, batches, and labelled results."""
+"""The loaded scene for a shot series: lidar, time bins, batches, labelled results; pilot shots, which show a gain."""
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
@@ -16,12 +18,14 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.sea.realization import PeriodicHeights
+from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.rendering.accumulators import described
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
 from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
 from mitransient_lidar.rendering.scene_checks import check_scene
-from mitransient_lidar.rendering.shots.batches import ReceivedShots, ShotBatches, check_size
+from mitransient_lidar.rendering.shots.batches import ReceivedShots, ShotBatches, ShotPoses, check_size
 from mitransient_lidar.transport.light_maps.renderer import LightMapRenderer
 from mitransient_lidar.transport.paths.passes import PassRenderer, PathClasses, check_solids
 from mitransient_lidar.transport.scene import LidarScene
@@ -34,22 +38,11 @@ AIM, TARGET = ("aim_x", "aim_y"), ("target_x", "target_y")
 class ShotScene:
     """The scene for a shot series, at the first one's location; its time bins are reported, and it is checked.
 
-    Parameters
-    ----------
-    scene, params, instrument, sensor
-        As for `loading.scenes.open_scene`, with the parameters ``aim_x`` and ``aim_y``.
-    places
-        Shot locations [m], shape (shots, 2).
-    target
-        Distance from the aim to the target [m], which moves with the shots; None if it stays.
-    axis
-        Time bins instead of automatic ones.
-    components, derivatives
-        As for `series.render_shots`.
-    check
-        Whether to tell the time bins, and to check the scene.
-    light
-        As in `series.render_shots`.
+    `scene`, `params`, `instrument`, `sensor`: as for `loading.scenes.open_scene`, with the parameters ``aim_x`` and
+    ``aim_y``. `places`: shot locations [m], shape (shots, 2). `target`: distance from the aim to the target [m], which
+    moves with the shots; None if it stays. `axis`: time bins instead of automatic ones. `components`, `derivatives`: as
+    for `series.render_shots`. `check`: whether to tell the time bins, and to check the scene. `light`: as in
+    `series.render_shots`.
     """
 
     def __init__(
@@ -159,3 +152,53 @@ def _checked_axis(axis: TimeAxis, own: TimeAxis) -> TimeAxis:
             f"{own.end_ns:g} ns"
         )
     return axis
+
+
+PILOTS, _WITHIN = 128, 200.0  #: Most pilot shots, and farthest place of theirs along x and y [m].
+
+#: Passes of pilot shots by merging and by light maps, and the relative error for which a merged pass has paths.
+MERGED_PASSES, _MAP_PASSES, _ERROR = 4, 2, 0.1
+
+_GOLDEN = 0.5 + 0.5 * math.sqrt(5)  #: Ratio whose multiples spread over a circle evenly, however many they are.
+
+
+def pilot_sea(sea: SeaSurface | None, count: int) -> tuple[FloatArray, FloatArray] | None:
+    """Return where pilot shots meet the sea, as `ShotPoses.other_sea`: the same in all flights and forecasts.
+
+    Waves come from all directions: which one a survey meets is not known when a gain is chosen. None for a sea that is
+    not alike everywhere.
+    """
+    if sea is None or not isinstance(sea.waves, PeriodicHeights) or sea.wake is not None:
+        return None
+    places = np.random.default_rng(0).uniform(-_WITHIN, _WITHIN, (count, 2))
+    azimuth = 2 * np.pi * np.arange(count) / _GOLDEN
+    return places, np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
+
+
+def pilots_over(loaded: ShotScene, depth: FloatArray, bottom: float, first_seed: int) -> xr.Dataset:
+    """Return pilot shots' light over a flat bottom.
+
+    `loaded`: the scene, for light by maps or by merging. `depth`: bottom depths below each shot [m], at most `bottom`,
+    shape (PILOTS,); without effect on merged light. `bottom`: depth of the scene's bottom [m]. `first_seed`: the first
+    shot's seed.
+    """
+    from mitransient_lidar.rendering.shots.batches import ShotPoses, share_for_error
+    from mitransient_lidar.rendering.shots.truth import sea_of
+
+    poses = ShotPoses(np.zeros((PILOTS, 2)), other_sea=pilot_sea(sea_of(loaded.session.scene), PILOTS))
+    if loaded.light == "maps":
+        return rendered(
+            loaded, loaded.batches(_MAP_PASSES, 1.0, None), replace(poses, raised=bottom - depth), first_seed
+        )
+    return rendered(loaded, loaded.batches(MERGED_PASSES, share_for_error(_ERROR), None), poses, first_seed)
+
+
+def rendered(loaded: ShotScene, batches: ShotBatches, poses: ShotPoses, first_seed: int) -> xr.Dataset:
+    """Return the light for any number of shots, as a series contains it."""
+    from mitransient_lidar.rendering.shots.batches import ReceivedShots
+
+    numbers = first_seed + np.arange(len(poses))
+    parts = [batches.render(poses.part(part), numbers[part].tolist()) for part in batches.parts(len(poses))]
+    attributes = loaded.attributes(used=batches.used_values, passes=batches.passes)
+    series: xr.Dataset = loaded.dataset(ReceivedShots.joined(parts), attributes)
+    return series

@@ -16,15 +16,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.options import (
-    Infrared,
-    Instrument,
-    Option,
-    SceneOrResult,
-    Sensor,
-    checked,
-    positive_option,
-)
+from mitransient_lidar.core.options import Infrared, Instrument, Option, SceneOrResult, Sensor, checked, positive_option
 from mitransient_lidar.core.parameters.lidar import LARGEST_COORDINATE
 from mitransient_lidar.core.tables.headings import Column
 from mitransient_lidar.core.tables.text_tables import read_two_columns
@@ -35,14 +27,7 @@ from mitransient_lidar.loading.catalogue import with_infrared
 from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.passes import (
-    Components,
-    LightOption,
-    Progress,
-    ProgressCallback,
-    RenderOptions,
-    warn_of_edge_loss,
-)
+from mitransient_lidar.rendering import passes as engine
 from mitransient_lidar.rendering.shots.batches import (
     MOST_PASSES_FOR_ERROR,
     ReceivedShots,
@@ -110,19 +95,19 @@ def render_shots(
         positive_option("Stop before this many seconds for all shots, with fewer passes or shots; by default no limit"),
     ] = None,
     pass_share: float | None = None,
-    light: LightOption = "merging",
+    light: engine.LightOption = "merging",
     seed: Annotated[int, Option("Seed of random places, by default 1", 0, 2**53)] = 1,
     first_seed: int = 0,
     axis: TimeAxis | None = None,
     shot_passes: ArrayLike | None = None,
-    components: Components = None,
+    components: engine.Components = None,
     derivatives: Sequence[str] | str | None = None,
     instrument: Instrument = None,
     infrared: Infrared = False,
     sensor: Sensor = None,
     describe_sea: bool = True,
     merge_unsuited: bool = False,
-    progress: ProgressCallback | None = None,
+    progress: engine.ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render shots at given or random locations on one sea, many at a time.
 
@@ -198,7 +183,7 @@ def render_shots(
         options_given["positions"] = np.column_stack([green[name] for name in AIM])
         return join(green, render_shots(**options_given))
     differentiated = [*derivatives] if derivatives else None
-    options = RenderOptions(
+    options = engine.RenderOptions(
         target_error=target_error, max_time=max_time, pass_share=pass_share, derivatives=differentiated, light=light
     )
     wanted = options.target_error
@@ -267,7 +252,7 @@ def render_shots(
     lost, energy = sum(one.lost for one in found), sum(one.whole[0].sum() for one in found)
     lost = lost / (lost + energy) if lost > 0 else 0.0
     received = ReceivedShots.joined(found)
-    warn_of_edge_loss(lost)
+    engine.warn_of_edge_loss(lost)
     attributes = series.attributes(
         used=batches.used_values,
         passes=int(received.passes.max()),
@@ -295,10 +280,12 @@ def render_shots(
     return series.dataset(received, attributes).assign_coords(known)
 
 
-def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, options: RenderOptions) -> Progress:
+def _progress(
+    done: int, planned: int, elapsed: float, errors: FloatArray, options: engine.RenderOptions
+) -> engine.Progress:
     """Return a series' progress, with the errors in its last batch."""
     median, p95 = np.quantile(errors, [0.5, 0.95], method="higher")
-    return Progress(
+    return engine.Progress(
         done=done,
         planned=planned,
         unit="shot",
@@ -346,7 +333,7 @@ def _checked_passes(given: ArrayLike | None, shots: int, passes: int) -> IntArra
 
 
 def _warn_of_the_end(
-    found: Sequence[ReceivedShots], done: int, planned: int, options: RenderOptions, interrupted: bool
+    found: Sequence[ReceivedShots], done: int, planned: int, options: engine.RenderOptions, interrupted: bool
 ) -> None:
     """Warn about shots that are missing, or have not reached the requested error, unless Ctrl-C has ended them."""
     if done < planned and not interrupted:

@@ -29,8 +29,7 @@ _REACH, _FEWEST_CELLS = 4.5, 4
 #: Slopes along and across the lidar's azimuth for each kind of shot, in units of `slope_sigmas` standard deviations.
 SLOPE_KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sideways": (0.0, 1.0)}
 
-#: Longest side of the sea that is searched [m].
-_LARGEST_SEARCH = 512.0
+_LARGEST_SEARCH = 512.0  #: Longest side of the sea that is searched [m].
 
 #: Largest difference between the nearest location and the wanted slopes, in slope standard deviations.
 _NEAREST = 1.0

@@ -11,41 +11,18 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.studies.publication import scenes
-from mitransient_lidar.studies.publication.scenes import (
-    PLACES_OF_SLOPE,
-    RANDOM,
-    SEAS,
-    Renders,
-    as_series,
-    described,
-    echo_gate,
-    geometry_of,
-)
-from mitransient_lidar.studies.publication.statements import (
-    Measured,
-    Series,
-    Waveform,
-    change,
-    decay,
-    duration,
-    estimate,
-    far_after_near,
-    half_width,
-    near_share,
-    rise_time,
-)
+from mitransient_lidar.studies.publication import scenes, statements
+from mitransient_lidar.studies.publication.scenes import PLACES_OF_SLOPE, SEAS, Renders, as_series
+from mitransient_lidar.studies.publication.statements import Measured, Series, Waveform
 from mitransient_lidar.studies.shots import depth_bias
 from mitransient_lidar.transport.sensor.outlines import enclosed_area
 
 #: Quantities by their names.
 Quantities = dict[str, Measured]
 
-#: Depths between which the decay of the backscatter is fitted, and backscatter is compared [m].
-_COLUMN = (2.0, 6.5)
+_COLUMN = (2.0, 6.5)  #: Depths between which the decay of the backscatter is fitted, and backscatter is compared [m].
 
-#: Least field of view in the publication's table 1 [rad].
-_LEAST_FIELD_OF_VIEW = 0.010
+_LEAST_FIELD_OF_VIEW = 0.010  #: Least field of view in the publication's table 1 [rad].
 
 #: Other locations with the slopes of two shots.
 _COMBINATIONS = f"combinations of {PLACES_OF_SLOPE * len(SEAS)} places of each slope on {len(SEAS)} seas"
@@ -57,25 +34,25 @@ _FACETS = "at places of the same mean slope, a few facets make the echo, so that
 def _measured(measure: Callable[..., float], result: xr.Dataset, others: Series | None = None, **more: Any) -> Measured:
     """Return a measure of a result's waveforms, and of each of others, for texts with further words."""
     elsewhere = None if others is None else others.each(measure)
-    words = {"shot": described(result), "random": RANDOM, **more}
-    return Measured(*estimate(measure, as_series(result)), elsewhere, words)
+    words = {"shot": scenes.described(result), "random": scenes.RANDOM, **more}
+    return Measured(*statements.estimate(measure, as_series(result)), elsewhere, words)
 
 
 def _column(result: xr.Dataset) -> tuple[float, float]:
     """Return the times of the column's depths [ns]."""
-    start, end = (float(geometry_of(result).time_of_depth(depth)) for depth in _COLUMN)
+    start, end = (float(scenes.geometry_of(result).time_of_depth(depth)) for depth in _COLUMN)
     return start, end
 
 
 def backscatter(renders: Renders) -> Quantities:
     """Return the backscatter decay (figure 1b)."""
     result, others = renders.shot(scenes.SINGLE), renders.random(scenes.FOUR)
-    gate, per_metre = _column(result), 2 * geometry_of(result).metres_per_ns
+    gate, per_metre = _column(result), 2 * scenes.geometry_of(result).metres_per_ns
     absorption = float(result.attrs["scene.attenuation"]) - float(result.attrs["scene.scattering"])
     return {
-        "residual": _measured(lambda one: decay(one, gate)[1], result, others),
+        "residual": _measured(lambda one: statements.decay(one, gate)[1], result, others),
         "absorption": _measured(
-            lambda one: absorption * per_metre / decay(one, gate)[0], result, others, absorption=absorption
+            lambda one: absorption * per_metre / statements.decay(one, gate)[0], result, others, absorption=absorption
         ),
     }
 
@@ -83,16 +60,14 @@ def backscatter(renders: Renders) -> Quantities:
 def sphere(renders: Renders) -> Quantities:
     """Return the depth of the sphere at 9 m (figure 2)."""
     result = renders.shot(scenes.MINE)
-    gate, geometry = echo_gate(result, 9.0), geometry_of(result)
-    return {
-        "sphere": _measured(lambda one: float(geometry.depth_of_time(one.highest(gate, "target")[1][0])), result),
-    }
+    gate, geometry = scenes.echo_gate(result, 9.0), scenes.geometry_of(result)
+    return {"sphere": _measured(lambda one: float(geometry.depth_of_time(one.highest(gate, "target")[1][0])), result)}
 
 
 def mast(renders: Renders) -> Quantities:
     """Return the light of the target below a mast (figure 4)."""
     result = renders.shot(scenes.MAST)
-    start, end = (float(geometry_of(result).time_of_depth(depth)) for depth in (0.5, 1.5))
+    start, end = (float(scenes.geometry_of(result).time_of_depth(depth)) for depth in (0.5, 1.5))
 
     def echo_share(one: Waveform) -> float:
         total = one.total()
@@ -124,7 +99,7 @@ def pixels_over_bottom(renders: Renders) -> Quantities:
     """Return delays, shares and durations of echoes in four pixels and one over a flat bottom (figure 9)."""
     four, single = renders.shot(scenes.FOUR), renders.shot(scenes.SINGLE)
     measured = functools.partial(_measured, result=four, others=renders.random(scenes.FOUR))
-    surface, bottom = (echo_gate(four, depth) for depth in (0.0, float(four.attrs["scene.bottom_depth"])))
+    surface, bottom = (scenes.echo_gate(four, depth) for depth in (0.0, float(four.attrs["scene.bottom_depth"])))
 
     def shares(one: Waveform) -> FloatArray:
         energy = one.power.sum(axis=1)
@@ -135,15 +110,15 @@ def pixels_over_bottom(renders: Renders) -> Quantities:
         return float(mean / measure(one.total(), 0, gate))
 
     total, one = four["waveform"].sum("pixel").values, single["waveform"].values[:, 0]
-    words = {"shot": described(four)}
+    words = {"shot": scenes.described(four)}
     return {
-        "surface_delay": measured(lambda pixels: far_after_near(pixels, surface)),
-        "bottom_delay": measured(lambda pixels: far_after_near(pixels, bottom)),
+        "surface_delay": measured(lambda pixels: statements.far_after_near(pixels, surface)),
+        "bottom_delay": measured(lambda pixels: statements.far_after_near(pixels, bottom)),
         "least_share": measured(lambda pixels: float(shares(pixels).min())),
         "largest_share": measured(lambda pixels: float(shares(pixels).max())),
         "sum": Measured(float(np.abs(total - one).max() / one.max()), words=words),
-        "rise": measured(lambda pixels: ratio(pixels, surface, rise_time)),
-        "width": measured(lambda pixels: ratio(pixels, bottom, half_width)),
+        "rise": measured(lambda pixels: ratio(pixels, surface, statements.rise_time)),
+        "width": measured(lambda pixels: ratio(pixels, bottom, statements.half_width)),
         "time": Measured(float(four.attrs["elapsed_s"]) / four.sizes["pixel"], words=words),
     }
 
@@ -152,14 +127,14 @@ def surface_echoes(renders: Renders) -> Quantities:
     """Return strengths and times of three shots' surface echoes (figure 10)."""
     shots, slopes = scenes.three_shots(renders), scenes.shot_slopes(renders)
     places = renders.of_slopes(scenes.SHOTS[0], slopes)
-    gate = echo_gate(shots[0], 0.0, 11.5)
-    words = {"shot": described(shots[0]), "facets": _FACETS, "combinations": _COMBINATIONS, "seas": len(SEAS)}
+    gate = scenes.echo_gate(shots[0], 0.0, 11.5)
+    words = {"shot": scenes.described(shots[0]), "facets": _FACETS, "combinations": _COMBINATIONS, "seas": len(SEAS)}
 
     def strength(one: Waveform) -> float:
         return float(one.highest(gate)[0].sum())
 
     def separation(one: Waveform) -> float:
-        return far_after_near(one, gate)
+        return statements.far_after_near(one, gate)
 
     def red_to_green(one: Waveform) -> float:
         red, green, *_ = one.highest(gate)[1]
@@ -188,9 +163,9 @@ def bottom_echoes(renders: Renders) -> Quantities:
     """Return strengths and depths of three shots' bottom echoes in the red pixel (figure 11)."""
     shots = scenes.three_shots(renders)
     places = renders.of_slopes(scenes.SHOTS[0], scenes.shot_slopes(renders))
-    gate = echo_gate(shots[0], float(shots[0].attrs["scene.bottom_depth"]), 12.0)
-    metres = geometry_of(shots[0]).depth_per_ns
-    words = {"shot": described(shots[2]), "facets": _FACETS, "combinations": _COMBINATIONS}
+    gate = scenes.echo_gate(shots[0], float(shots[0].attrs["scene.bottom_depth"]), 12.0)
+    metres = scenes.geometry_of(shots[0]).depth_per_ns
+    words = {"shot": scenes.described(shots[2]), "facets": _FACETS, "combinations": _COMBINATIONS}
 
     def height(one: Waveform) -> float:
         return float(one.highest(gate)[0][0])
@@ -219,7 +194,9 @@ def _pair(
 
     The latter are NaN where a location has no measure.
     """
-    value = estimate(lambda a, b: join(measure(a), measure(b)), *(as_series(shots[number]) for number in pair))
+    value = statements.estimate(
+        lambda a, b: join(measure(a), measure(b)), *(as_series(shots[number]) for number in pair)
+    )
     one, other = (places[number].each(measure) for number in pair)
     return value, np.asarray(join.outer(one, other)).ravel()
 
@@ -238,14 +215,14 @@ def paths(renders: Renders) -> Quantities:
 def square_target(renders: Renders) -> Quantities:
     """Return the target's echo in 2x2 pixels (figure 13)."""
     others = renders.random(scenes.SQUARE, move_target=True)
-    return {"near_share": _measured(near_share, renders.shot(scenes.SQUARE), others)}
+    return {"near_share": _measured(statements.near_share, renders.shot(scenes.SQUARE), others)}
 
 
 def strip_target(renders: Renders) -> Quantities:
     """Return the target's echo and the backscatter in 1x4 pixels (figure 14)."""
     result = renders.shot(scenes.STRIPS)
     measured = functools.partial(_measured, result=result, others=renders.random(scenes.STRIPS, move_target=True))
-    column, gate = _column(result), echo_gate(result, float(result.attrs["scene.target_depth"]), 14.0)
+    column, gate = _column(result), scenes.echo_gate(result, float(result.attrs["scene.target_depth"]), 14.0)
 
     def backscatter_ratio(one: Waveform, outer: int, inner: int) -> float:
         power = one.inside(column)
@@ -263,7 +240,7 @@ def strip_target(renders: Renders) -> Quantities:
         return float(contrast[3] / contrast[2])
 
     return {
-        "near_share": measured(near_share),
+        "near_share": measured(statements.near_share),
         "red_over_green": measured(lambda one: backscatter_ratio(one, 0, 1)),
         "black_over_blue": measured(lambda one: backscatter_ratio(one, 3, 2)),
         "echoes": measured(echoes),
@@ -274,14 +251,14 @@ def strip_target(renders: Renders) -> Quantities:
 def layer_delays(renders: Renders) -> Quantities:
     """Return delays of the surface echo and of the water's change in the near pixels (figure 15)."""
     four, others = renders.shot(scenes.LAYERED_FOUR), renders.random(scenes.LAYERED_FOUR)
-    gate, middles = echo_gate(four, 0.0), scenes.layer_times(four)
+    gate, middles = scenes.echo_gate(four, 0.0), scenes.layer_times(four)
 
     def layer(one: Waveform) -> float:
-        times = np.array([np.mean(change(one, pixel, middle)) for pixel, middle in enumerate(middles)])
+        times = np.array([np.mean(statements.change(one, pixel, middle)) for pixel, middle in enumerate(middles)])
         return float(times[:2].mean() - times[2:].mean())
 
     return {
-        "surface_delay": _measured(lambda one: far_after_near(one, gate), four, others),
+        "surface_delay": _measured(lambda one: statements.far_after_near(one, gate), four, others),
         "layer_delay": _measured(layer, four, others),
     }
 
@@ -294,10 +271,10 @@ def layer_durations(renders: Renders) -> Quantities:
     shortest = 2 * float(single.attrs["pulse_fwhm_ns"]) / math.sqrt(8 * math.log(2))
 
     def mean_ratio(one: Waveform) -> float:
-        pixels = np.array([duration(one, pixel, time) for pixel, time in enumerate(middles)])
-        return float(pixels.mean() / duration(one.total(), 0, middle))
+        pixels = np.array([statements.duration(one, pixel, time) for pixel, time in enumerate(middles)])
+        return float(pixels.mean() / statements.duration(one.total(), 0, middle))
 
     return {
         "ratio": _measured(mean_ratio, four, renders.random(scenes.LAYERED_FOUR)),
-        "duration": _measured(lambda one: duration(one, 0, middle), single, shortest=shortest),
+        "duration": _measured(lambda one: statements.duration(one, 0, middle), single, shortest=shortest),
     }

@@ -28,17 +28,11 @@ from mitransient_lidar.transport.sensor.outlines import pixel_outlines
 
 _LOG = logging.getLogger(__name__)
 
-#: Renders of a place with independent random numbers, from whose spread standard errors come.
-REPEATS = 8
+REPEATS = 8  #: Renders of a place with independent random numbers, from whose spread standard errors come.
+SEAS = (1, 2, 3)  #: Seas for the other locations, as values of ``surface_seed``.
+RANDOM_PLACES, PLACES_OF_SLOPE = 12, 5  #: Locations on each sea: random ones, and those with each shot's slopes.
 
-#: Seas for the other locations, as values of ``surface_seed``.
-SEAS = (1, 2, 3)
-
-#: Locations on each sea: random ones, and those with each shot's slopes.
-RANDOM_PLACES, PLACES_OF_SLOPE = 12, 5
-
-#: Random places in words.
-RANDOM = f"{RANDOM_PLACES * len(SEAS)} random places on {len(SEAS)} seas"
+RANDOM = f"{RANDOM_PLACES * len(SEAS)} random places on {len(SEAS)} seas"  #: Random places in words.
 
 #: Share of a full pass's paths, passes per location, and most passes for the requested error.
 _SHARE, _PASSES, _MOST_PASSES = 0.25, 4, 256
@@ -183,8 +177,7 @@ SQUARE, STRIPS, LAYERED_FOUR, LAYERED_SINGLE = "fig13_2x2", "fig14_1x4", "fig15_
 LAYOUTS = (SINGLE, FOUR, STRIPS)
 SHOTS, _BIN_WIDTH_NS = ("fig11_shot1", "fig11_shot2", "fig11_shot3"), 0.25
 
-#: Depth of the water's change [m].
-_LAYER_DEPTH = 3.0
+_LAYER_DEPTH = 3.0  #: Depth of the water's change [m].
 
 
 @dataclass(frozen=True, kw_only=True)

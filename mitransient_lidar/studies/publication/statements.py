@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mitransient_lidar.analysis.jackknife import jackknife_error
+from mitransient_lidar.analysis.information.errors import jackknife_error
 from mitransient_lidar.core.tables.written import table_lines, write_csv
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.studies.shots import highest_of
@@ -27,8 +27,7 @@ COLUMNS = (
     "difference",
 )
 
-#: Standard errors within which a quantity at a limit may lie on either side.
-_MARGIN = 2.0
+_MARGIN = 2.0  #: Standard errors within which a quantity at a limit may lie on either side.
 
 
 class Measured(NamedTuple):
@@ -115,8 +114,7 @@ def describe_statements(statements: Sequence[Statement]) -> list[str]:
     return [line + text for line, text in zip(table_lines(columns, rows), texts, strict=True)]
 
 
-#: Shares of an echo's height between which its rise is measured.
-_FIRST, _LAST = 0.1, 0.9
+_FIRST, _LAST = 0.1, 0.9  #: Shares of an echo's height between which its rise is measured.
 
 #: Distance of a change from its expected time, and lag of the differences that give its curvature [ns].
 _REACH_NS, _LAG_NS = 9.0, 1.0

@@ -88,11 +88,9 @@ class BubblePlume:
         return dr.select(end < far, end, dr.inf)
 
 
-#: Relative change of the density along a segment below which series replace quotients that cancel.
-_SMALL = 1e-2
+_SMALL = 1e-2  #: Relative change of the density along a segment below which series replace quotients that cancel.
 
-#: Least vertical component of a direction, which stands for level ones.
-_LEVEL = 1e-9
+_LEVEL = 1e-9  #: Least vertical component of a direction, which stands for level ones.
 
 
 @dataclass(frozen=True)

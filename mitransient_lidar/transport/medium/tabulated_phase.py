@@ -14,8 +14,7 @@ from mitransient_lidar.transport.opaque import aligned
 #: Exponents are kept this far from 1 when sampled; the density within a segment changes by 1e-5.
 _SMALLEST_EXPONENT = 1e-3
 
-#: s = sin^2(theta/2) of 2e-7 rad, below which float32 directions are the same.
-_SMALLEST_S = 1e-14
+_SMALLEST_S = 1e-14  #: s = sin^2(theta/2) of 2e-7 rad, below which float32 directions are the same.
 
 #: Largest node spacing in ln s, change in ln p between nodes, and first node for which a series replaces logarithm and
 #: exponential and the cap below the first node (2 microradian) is uniform: both are exact to float32.

@@ -16,8 +16,7 @@ from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases
 from mitransient_lidar.transport.opaque import aligned, opaque
 
-#: Largest number of index layers: connections are traced through each.
-MOST_INDEX_LAYERS = 16
+MOST_INDEX_LAYERS = 16  #: Largest number of index layers: connections are traced through each.
 
 #: Vertical distance within which solids and boundaries coincide: absolute [m], and over the length of a ray.
 _SAME, _SAME_PER_LENGTH = 2e-5, 2.0**-20

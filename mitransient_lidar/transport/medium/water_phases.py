@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +16,6 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0, PowerLawTable
 from mitransient_lidar.physics.water.seawater import water_phase_function
-from mitransient_lidar.transport.medium.nested_objects import create_object
 from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase, TabulatedPhase, deflect
 
 
@@ -30,11 +29,8 @@ class HasTable(Protocol):
 #: Beyond this number of different mixtures, bb/b and pure water's share are rounded to this step in their logarithms.
 _MOST_FUNCTIONS, _STEP = 16, 0.02
 
-#: bb/b where there are no particles, without effect.
-_ANY_RATIO = 0.0183
-
-#: Share of the scattering below which pure water is left out.
-_SMALLEST_SHARE = 1e-4
+_ANY_RATIO = 0.0183  #: bb/b where there are no particles, without effect.
+_SMALLEST_SHARE = 1e-4  #: Share of the scattering below which pure water is left out.
 
 
 class ScattererPhases:
@@ -204,3 +200,16 @@ def table_of(phase: mi.PhaseFunction) -> PowerLawTable:
     value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, deflect(mi.Frame3f(-mei.wi), mi.Float(s), mi.Float(0)))
     # An isotropic function's value is one number.
     return PowerLawTable.from_values(np.broadcast_to(np.array(value[0], dtype=np.float64), s.shape))
+
+
+def create_object(kind: str, **values: Any) -> Any:
+    """Return a Mitsuba object of a plugin type with given parameters, nested objects among them.
+
+    Constructors must not call ``mitsuba.load_dict``. It replaces Mitsuba's file resolver while it works;
+    ``mitsuba.load_file`` makes objects in several threads. One may just use the resolver to find a plugin's library: 5
+    to 15 % of processes then failed in their first load, as with "basic_string::_M_create".
+    """
+    properties = mi.Properties(kind)
+    for name, value in values.items():
+        properties[name] = value
+    return mi.PluginManager.instance().create_object(properties)

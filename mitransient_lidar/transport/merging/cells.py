@@ -16,21 +16,15 @@ from mitransient_lidar.transport.opaque import changed, opaque, opaque_point
 from mitransient_lidar.transport.rng import starts
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Base-2 logarithm of the largest number of buckets per shot.
-MOST_BUCKET_BITS = 20
-
-#: Largest growth of cell width with depth.
-_MOST_GROWTH = 4.0
+MOST_BUCKET_BITS = 20  #: Base-2 logarithm of the largest number of buckets per shot.
+_MOST_GROWTH = 4.0  #: Largest growth of cell width with depth.
 
 #: Growth of layer thickness with depth, up to the final one: facets focus light in patterns that change with depth, and
 #: twice this growth loses 3 % of the column below 15 cm waves.
 _THICKNESS_PER_DEPTH = 0.25
 
-#: Least thickness of the uppermost layer, over the final one.
-_LEAST_THICKNESS = 0.01
-
-#: Least vertical component of the directions along which points move to their layer's plane.
-_LEAST_DESCENT = 0.5
+_LEAST_THICKNESS = 0.01  #: Least thickness of the uppermost layer, over the final one.
+_LEAST_DESCENT = 0.5  #: Least vertical component of the directions along which points move to their layer's plane.
 
 #: Least thickness of a cell that a solid cuts relative to a whole one, and in water that is no deeper than one cell.
 _LEAST_CUT, _LEAST_WEDGE = 0.25, 0.01
@@ -38,8 +32,7 @@ _LEAST_CUT, _LEAST_WEDGE = 0.25, 0.01
 #: Steps to the surface above a point along the beam, and least volume below a slope over that below level water.
 _SURFACE_STEPS, _LEAST_STRETCH = 2, 0.1
 
-#: Least sea slope, against division by zero.
-_LEAST_SLOPE = 1e-9
+_LEAST_SLOPE = 1e-9  #: Least sea slope, against division by zero.
 
 #: Halo of the unscattered light's profile relative to its core, and squared distance from the axis, in standard
 #: deviations, that parts both.
@@ -48,8 +41,7 @@ _HALO, _SQUARES_INSIDE = 0.02, 25.0
 #: Step of the planes' places from one layer to the next, which distributes them evenly: the golden ratio.
 _PLANE_STEP = 0.618034
 
-#: Added to cell numbers so that they are positive.
-ORIGIN = 1 << 20
+ORIGIN = 1 << 20  #: Added to cell numbers so that they are positive.
 
 
 @dataclass(frozen=True)
@@ -145,23 +137,13 @@ class WaterCells:
     goes to where its light would cross this plane along the beam, refracted and spread. Narrow beams do not blur,
     however they are refracted.
 
-    Parameters
-    ----------
-    profile
-        Beam profile, for changes between points and the plane.
-    width
-        Horizontal side of a cell on the axis at the surface, over the rings' core radius.
-    growth
-        Growth of the width with depth [1/m], as the waves' light patterns blur with depth.
-    thickness, uppermost
-        Thickness of a cell, and of the uppermost ones, which may be thinner [m]: narrow beams spread fast there.
-    depth
-        Depth within which different layers have different buckets [m].
-    bits
-        Base-2 logarithm of the number of buckets per shot.
-    view_growth, widening
-        Further growth with depth [1/m], as ripples widen the visible light, for cells that a narrow view limits at the
-        surface; and the largest width that it reaches relative to the surface.
+    `profile`: beam profile, for changes between points and the plane. `width`: horizontal side of a cell on the axis at
+    the surface, over the rings' core radius. `growth`: growth of the width with depth [1/m], as the waves' light
+    patterns blur with depth. `thickness`, `uppermost`: thickness of a cell, and of the uppermost ones, which may be
+    thinner [m]: narrow beams spread fast there. `depth`: depth within which different layers have different buckets
+    [m]. `bits`: base-2 logarithm of the number of buckets per shot. `view_growth`, `widening`: further growth with
+    depth [1/m], as ripples widen the visible light, for cells that a narrow view limits at the surface; and the largest
+    width that it reaches relative to the surface.
     """
 
     OF_SHOTS = ("heights", "rings", "_shift", "_start")
@@ -345,11 +327,9 @@ def low_bits(number: mi.UInt32, bits: int) -> mi.UInt32:
 #: Angular ring width, over the beam's standard deviation within two of them, and over the angle farther outside.
 _RING_PER_SPREAD, _CORE_SPREADS = 0.1, 2.0
 
-#: Largest thickness of a shell over its radius: the light decreases by its square.
-_THICKNESS_PER_RADIUS = 0.04
+_THICKNESS_PER_RADIUS = 0.04  #: Largest thickness of a shell over its radius: the light decreases by its square.
 
-#: Smallest shell radius [m].
-_SMALLEST_RADIUS = 1e-3
+_SMALLEST_RADIUS = 1e-3  #: Smallest shell radius [m].
 
 #: Base-2 logarithm of the number of buckets, and bits for the numbers of ring and sector.
 _BUCKET_BITS, _RING_BITS, _SECTOR_BITS = 20, 11, 9

@@ -23,8 +23,7 @@ from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS
 #: points take a third less time and increase the water's variance by a half: more paths are better there.
 _POINTS_PER_PATH, _POINTS_PER_IMAGE_PATH = 14, 10
 
-#: Photons in a full pass.
-PHOTONS = 2**15
+PHOTONS = 2**15  #: Photons in a full pass.
 
 #: Cell width at the surface, relative to the beam's standard deviation there, to the sea's facet side, and to the
 #: field-of-view diameter, which ripples widen with depth: few larger cells would contain the visible light.

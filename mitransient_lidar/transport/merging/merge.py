@@ -84,11 +84,7 @@ def merge_in_water(
 
 
 def merge_on_solids(
-    patches: SolidPatches,
-    received: ReceivedLight,
-    photons: PhotonMap | None,
-    connections: mi.Float,
-    rng: mi.PCG32,
+    patches: SolidPatches, received: ReceivedLight, photons: PhotonMap | None, connections: mi.Float, rng: mi.PCG32
 ) -> Action:
     """Return the action that merges the receiver's paths with the light on the solids that they meet.
 
@@ -160,8 +156,7 @@ def receive(
     received.histogram.lose(energy, active & lost)
 
 
-#: Points of the receiver's paths for each one that is connected.
-_POINTS_PER_CONNECTION = 4
+_POINTS_PER_CONNECTION = 4  #: Points of the receiver's paths for each one that is connected.
 
 #: Distance between the place of a photon and where a ray meets its solid, absolute [m] and over the ray's length.
 _TOLERANCE, _RELATIVE_TOLERANCE = 1e-3, 1e-4
@@ -215,14 +210,9 @@ class WaterConnections:
         Path and point are drawn one after the other. Paths with other points, in a scene that differs a little, then
         change no other pairs. Partners are points on light paths, or photon numbers in a shot.
 
-        Returns
-        -------
-        lanes
-            Lanes of the pairs, which their numbers count.
-        point, partner
-            The points, and their partners' numbers.
-        weight
-            Reciprocal of the expected number of pairs with the same point and partner; 0 where one does not exist.
+        Returns `lanes`: lanes of the pairs, which their numbers count. `point`, `partner`: the points, and their
+        partners' numbers. `weight`: reciprocal of the expected number of pairs with the same point and partner; 0 where
+        one does not exist.
         """
         points = self._points
         lanes = self._shots.paths(points.paths * self.rates.per_path)

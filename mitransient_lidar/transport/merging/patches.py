@@ -20,11 +20,8 @@ from mitransient_lidar.transport.rng import Lanes, starts
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.solids import box_of, met_shape
 
-#: Base-2 logarithm of the largest number of buckets per shot along one side.
-MOST_SIDE_BITS = 9
-
-#: Level height in the patches of bounded solids, over the patch width.
-_LEVEL_WIDTHS = 8
+MOST_SIDE_BITS = 9  #: Base-2 logarithm of the largest number of buckets per shot along one side.
+_LEVEL_WIDTHS = 8  #: Level height in the patches of bounded solids, over the patch width.
 
 #: Component of a normal along the beam, over the larger horizontal one, below which a surface counts as steep.
 _STEEP = 0.3
@@ -32,11 +29,9 @@ _STEEP = 0.3
 #: Least foreshortening of surfaces: below it, light is not evened out between points in a patch.
 _LEAST_FORESHORTENING = 0.02
 
-#: Number of rays at each of several locations that find solids with several levels.
-_PROBE_RAYS_OF_SHOTS = 512
+_PROBE_RAYS_OF_SHOTS = 512  #: Number of rays at each of several locations that find solids with several levels.
 
-#: Largest number of hits per vertical ray in the search for solids with several levels.
-_MOST_LEVELS = 8
+_MOST_LEVELS = 8  #: Largest number of hits per vertical ray in the search for solids with several levels.
 
 #: Distance before a point at which rays to it end [m], and the same over its largest coordinate: half the distance by
 #: which coincident faces are moved apart.

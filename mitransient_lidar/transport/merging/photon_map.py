@@ -48,20 +48,10 @@ class PhotonMap:
 
     Full buckets keep only some photons, at random, with larger weights that have the same sum if all are equal.
 
-    Parameters
-    ----------
-    light
-        The light.
-    buckets, bucket, tag
-        Number of buckets; each photon's bucket, and its cell's or patch's tag there.
-    further
-        A further number for each.
-    u
-        Uniform random numbers that select photons.
-    most
-        Expected number of photons kept in a bucket with more.
-    classes
-        Path classes, which need the numbers of scattering events or not.
+    `light`: the light. `buckets`, `bucket`, `tag`: number of buckets; each photon's bucket, and its cell's or patch's
+    tag there. `further`: a further number for each. `u`: uniform random numbers that select photons. `most`: expected
+    number of photons kept in a bucket with more. `classes`: path classes, which need the numbers of scattering events
+    or not.
     """
 
     def __init__(

@@ -16,33 +16,25 @@ from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays
 from mitransient_lidar.transport.rng import Lanes, starts, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Number of rays that find where each shot's beam meets the sea.
-_ENTRY_RAYS = 64
+_ENTRY_RAYS = 64  #: Number of rays that find where each shot's beam meets the sea.
 
 #: Share of rays that may fall outside the region on either side, and margin over its size.
 _REGION_TAIL, _REGION_MARGIN = 0.002, 0.15
 
-#: Least margin of a region under water [m].
-_LEAST_MARGIN = 1.0
+_LEAST_MARGIN = 1.0  #: Least margin of a region under water [m].
 
 #: Distance beside the view within which light counts, over the view size and over the longest way in the water: height
 #: tables below a whole very wide beam would not resolve its waves.
 _BESIDE_PER_VIEW, _BESIDE_PER_LENGTH = 2.0, 2.0
 
-#: Distance beside the beam within which light spreads, over the depth.
-_SPREAD_PER_DEPTH = 0.25
+_SPREAD_PER_DEPTH = 0.25  #: Distance beside the beam within which light spreads, over the depth.
 
 #: Cells per side of the height tables, for a single shot and for each of several.
 _HEIGHT_CELLS, _HEIGHT_CELLS_OF_SHOTS = 512, 64
 
-#: Largest number of times that a line through the mean sea level crosses the waves.
-_MOST_CROSSINGS = 4
-
-#: Largest distance below the sea at which vertical rays to solids start [m].
-_MARGIN_BELOW_SEA = 1.0
-
-#: Bed height in columns without a solid below [m].
-_NO_BED = -1e9
+_MOST_CROSSINGS = 4  #: Largest number of times that a line through the mean sea level crosses the waves.
+_MARGIN_BELOW_SEA = 1.0  #: Largest distance below the sea at which vertical rays to solids start [m].
+_NO_BED = -1e9  #: Bed height in columns without a solid below [m].
 
 
 @dataclass(frozen=True)

@@ -38,12 +38,9 @@ _PHOTONS_FOR_IMAGES = 2**16
 _PATHS_PER_COMPLEMENT_PATH = 16
 
 _COMPLEMENT_PATHS = 1024  # least number of path tracer paths in a pass over all shots
+_POINTS_OF_LIGHT = 0.8  #: Expected points on a light path, relative to a straight one, to scale the connection rate.
 
-#: Expected points on a light path, relative to a straight one, to scale the connection rate.
-_POINTS_OF_LIGHT = 0.8
-
-#: Capacity for segments and hits over the need of the last pass.
-_CAPACITY_MARGIN = 1.25
+_CAPACITY_MARGIN = 1.25  #: Capacity for segments and hits over the need of the last pass.
 
 #: One in this many image paths is merged at its points in the water: they took half the time, and bottoms and targets
 #: need more paths. Where paths are few, passes have more, as their light takes time, too.

@@ -16,17 +16,11 @@ from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.transport.medium.water import refract
 from mitransient_lidar.transport.opaque import aligned, changed, opaque
 
-#: Growth of the core radius with depth [m/m], as light spreads by ripples and scattering.
-_CORE_PER_METRE = 0.05
+_CORE_PER_METRE = 0.05  #: Growth of the core radius with depth [m/m], as light spreads by ripples and scattering.
+_SMALLEST_COSINE = 0.01  #: Least cosine of the axis with the vertical, for axes close to the horizon and above it.
 
-#: Least cosine of the axis with the vertical, for axes close to the horizon and above it.
-_SMALLEST_COSINE = 0.01
-
-#: Largest slope of the axis against the vertical along which patches are projected.
-_LARGEST_SLANT = 2.0
-
-#: Core radius at the surface over the beam's standard deviation there.
-CORE_PER_SPREAD = 2.0
+_LARGEST_SLANT = 2.0  #: Largest slope of the axis against the vertical along which patches are projected.
+CORE_PER_SPREAD = 2.0  #: Core radius at the surface over the beam's standard deviation there.
 
 #: Least and largest width of cells on the axis, over the core radius: rings have different 32-bit numbers, and are not
 #: wider than the beam.
@@ -76,18 +70,9 @@ class BeamRings:
     With the core radius q, rings have equal widths in arsinh(r / q). The widths are nearly equal in the core, and
     proportional to the radius r far from it. On an obliquely lit sea rings are ellipses, as footprints are.
 
-    Parameters
-    ----------
-    pose
-        Laser pose.
-    spread
-        Beam standard deviation where its axis meets the sea, across the axis [m].
-    index
-        Refractive index of the water over that at the laser.
-    growth
-        Growth of the core radius with depth [m/m].
-    tilt
-        Mean slopes of the sea along x and y, which refracts the axis [1], shape (1, 2); by default it is level.
+    `pose`: laser pose. `spread`: beam standard deviation where its axis meets the sea, across the axis [m]. `index`:
+    refractive index of the water over that at the laser. `growth`: growth of the core radius with depth [m/m]. `tilt`:
+    mean slopes of the sea along x and y, which refracts the axis [1], shape (1, 2); by default it is level.
 
     The axis begins where it meets the mean sea level, or where each shot's beam meets the sea (`of_entries`).
     """
@@ -95,12 +80,7 @@ class BeamRings:
     OF_SHOTS = ("_entry", "shear", "slant", "_level", "tilt")
 
     def __init__(
-        self,
-        pose: Pose,
-        spread: float,
-        index: float,
-        growth: float = _CORE_PER_METRE,
-        tilt: FloatArray | None = None,
+        self, pose: Pose, spread: float, index: float, growth: float = _CORE_PER_METRE, tilt: FloatArray | None = None
     ) -> None:
         self.spread, self._growth, self._index = opaque(spread), opaque(growth), index
         self._entry = mi.Vector3f(opaque(0.0))

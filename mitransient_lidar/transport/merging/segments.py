@@ -42,8 +42,7 @@ _FIELDS = {
 }
 
 
-#: Neighbouring paths that are stored together: the sets of the receiver's samples take turns.
-PATHS_OF_GROUP = 4
+PATHS_OF_GROUP = 4  #: Neighbouring paths that are stored together: the sets of the receiver's samples take turns.
 
 
 class SegmentBuffer:
@@ -159,23 +158,15 @@ class SegmentBuffer:
         )
 
 
-#: Numbers in a packet.
-_PACKET = 4
-
-#: Sign bit of a number, and all other bits.
-_SIGN, _MAGNITUDE = 1 << 31, (1 << 31) - 1
+_PACKET = 4  #: Numbers in a packet.
+_SIGN, _MAGNITUDE = 1 << 31, (1 << 31) - 1  #: Sign bit of a number, and all other bits.
 
 
 class PackedStore:
     """Stored numbers for points, one entry per point.
 
-    Parameters
-    ----------
-    size
-        Number of entries.
-    fields
-        Stored fields, in the order of their packets with four numbers: by name a Mitsuba type, or a number list's
-        length. ``number|flag`` are a number, 0 or more, and a flag in its sign bit.
+    `size`: number of entries. `fields`: stored fields, in the order of their packets with four numbers: by name a
+    Mitsuba type, or a number list's length. ``number|flag`` are a number, 0 or more, and a flag in its sign bit.
     """
 
     def __init__(self, size: int, fields: Mapping[str, str | int]) -> None:

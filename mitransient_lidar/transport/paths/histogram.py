@@ -15,8 +15,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index
 from mitransient_lidar.transport.perturbations import Perturbations, Sums
 
-#: Largest number of sums: more do not fit a laptop's memory.
-_LARGEST = 2**28
+_LARGEST = 2**28  #: Largest number of sums: more do not fit a laptop's memory.
 
 #: Share of a gate's largest weight below which others are neglected: 5 standard deviations of a Gaussian pulse.
 _SMALLEST_WEIGHT = 1e-7
@@ -80,20 +79,10 @@ class TransientHistogram:
 
     Raises UserError when pixels times bins, or pixels times gates, with the perturbations exceed 2^28.
 
-    Parameters
-    ----------
-    axis
-        Time bins of the record.
-    shape
-        Numbers of pixels, (pixels,) or (rows, columns).
-    emitted
-        Energy that the laser emits [J], the most that a bin receives.
-    gates
-        Gates that are summed instead of the time bins, or None.
-    reference_length
-        Length that is left out of path lengths [m], so that they are accurate in single precision.
-    perturbations
-        Perturbations, each of which is summed as the energies are.
+    `axis`: time bins of the record. `shape`: numbers of pixels, (pixels,) or (rows, columns). `emitted`: energy that
+    the laser emits [J], the most that a bin receives. `gates`: gates that are summed instead of the time bins, or None.
+    `reference_length`: length that is left out of path lengths [m], so that they are accurate in single precision.
+    `perturbations`: perturbations, each of which is summed as the energies are.
     """
 
     #: Memory per bin, or per gate [bytes]: two sums and a mark.

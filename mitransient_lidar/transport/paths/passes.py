@@ -31,14 +31,12 @@ _MANY_PIXEL_BITS, _MOST_COUNTED = 28, 15
 
 _MOST = (1 << _ORDER_BITS) - 1
 
-#: Largest number of orders that can be separated.
-MOST_ORDERS = _MOST - 1
+MOST_ORDERS = _MOST - 1  #: Largest number of orders that can be separated.
 
 #: Origins without a solid: light that has met the sea surface alone, and light that the water has scattered.
 ORIGINS = ("surface", "water")
 
-#: Largest number of solids whose light can be separated: each takes as much memory as all light.
-_MOST_SOLIDS = 30
+_MOST_SOLIDS = 30  #: Largest number of solids whose light can be separated: each takes as much memory as all light.
 
 
 def check_solids(number: int) -> None:
@@ -302,5 +300,4 @@ class LidarIntegrator(Protocol):
 
     plugin: str
     passive: bool
-    #: Returns the pass renderer for a scene, as `LidarPassIntegrator.prepare`.
-    prepare: Callable[..., PassRenderer]
+    prepare: Callable[..., PassRenderer]  #: Returns the pass renderer for a scene, as `LidarPassIntegrator.prepare`.

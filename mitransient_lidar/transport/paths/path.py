@@ -16,8 +16,7 @@ from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import WaterScene
 from mitransient_lidar.transport.solids import met_shape
 
-#: Surface length of paths that have not met the sea first [m].
-NO_SURFACE = 1e9
+NO_SURFACE = 1e9  #: Surface length of paths that have not met the sea first [m].
 
 
 @dataclass(kw_only=True)

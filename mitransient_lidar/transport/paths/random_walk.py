@@ -68,18 +68,10 @@ class RandomWalk:
     Free flights are drawn from the scattering coefficient, and absorption is a weight, so that absorption does not end
     paths before the bottom.
 
-    Parameters
-    ----------
-    scene
-        Scene with water.
-    mode
-        ``Importance`` for light from the laser, ``Radiance`` for paths from the receiver.
-    destination
-        Receiver pose for light, laser pose for paths from the receiver.
-    path_end
-        Optical path length at which the record ends [m]: paths that cannot arrive before end.
-    rates
-        Rates of the estimates at scattering events; without them `mis_partial_sum` stays 0.
+    `scene`: scene with water. `mode`: ``Importance`` for light from the laser, ``Radiance`` for paths from the
+    receiver. `destination`: receiver pose for light, laser pose for paths from the receiver. `path_end`: optical path
+    length at which the record ends [m]: paths that cannot arrive before end. `rates`: rates of the estimates at
+    scattering events; without them `mis_partial_sum` stays 0.
     """
 
     def __init__(

@@ -17,8 +17,7 @@ from mitransient_lidar.transport.scene import LidarScene, WaterScene
 #: Newton steps towards Snell's law: four leave less than 1e-4 rad even 5 m above and 40 m below the sea at 80 degrees.
 _NEWTON_STEPS = 4
 
-#: Smallest depth of a point [m], which keeps the equations regular at the surface.
-_SMALLEST_DEPTH = 1e-4
+_SMALLEST_DEPTH = 1e-4  #: Smallest depth of a point [m], which keeps the equations regular at the surface.
 
 
 @dataclass
@@ -256,13 +255,9 @@ def connect_event_to_laser(
 def connect_laser(scene: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """Connect surface points to the laser by straight lines in the air, or in the water of a laser under water.
 
-    Returns
-    -------
-    radiance
-        Energy per area and solid angle [J/(m^2 sr)] along ``si.wi`` by the light that no shape blocks. It is intensity
-        times BSDF with its cosine times inverse square distance; 0 on the other side of the sea surface.
-    length
-        Length of the line [m], relative to the distance to the scene's reference point.
+    Returns `radiance`: energy per area and solid angle [J/(m^2 sr)] along ``si.wi`` by the light that no shape blocks.
+    It is intensity times BSDF with its cosine times inverse square distance; 0 on the other side of the sea surface.
+    `length`: length of the line [m], relative to the distance to the scene's reference point.
     """
     line = StraightConnection.to_laser(scene, si.p)
     radiance = _bsdf_towards(scene, si, line.direction, active, wet=scene.submerged) * line.irradiance

@@ -12,12 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import snell
-from mitransient_lidar.physics.sea.double_passage import (
-    LEAST_DEPTH,
-    EnhancementTable,
-    slope_spread,
-    slope_structures,
-)
+from mitransient_lidar.physics.sea.double_passage import LEAST_DEPTH, EnhancementTable, slope_spread, slope_structures
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.two_way_spread import displacements
@@ -26,14 +21,9 @@ from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.perturbations import Perturbation, Sums
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Largest depth in the table [m], and its number of depths.
-_DEEPEST, _DEPTHS = 60.0, 20
-
-#: Largest number of forward scattering events that is distinguished.
-_MOST_EVENTS = 7
-
-#: Displacement samples.
-_SAMPLES = 1000
+_DEEPEST, _DEPTHS = 60.0, 20  #: Largest depth in the table [m], and its number of depths.
+_MOST_EVENTS = 7  #: Largest number of forward scattering events that is distinguished.
+_SAMPLES = 1000  #: Displacement samples.
 
 
 @dataclass(frozen=True)
@@ -52,19 +42,10 @@ class RippleFocusing:
     the ratio of the enhancements with and without correlated ripples. It depends on the echo's depth and the number of
     forward scattering events, which move one way against the other (`physics.sea.double_passage`).
 
-    Parameters
-    ----------
-    depths, factors
-        Depths [m], and factors, of shape (`_MOST_EVENTS` + 1, `_DEPTHS`).
-    depth_per_length
-        Echo depth over its path's optical length beyond the surface path.
-    enhancement
-        Enhancement by all waves, in the shape of `factors`.
-    events
-        Mean number of scattering events on both ways to each depth.
-    enhancements
-        Returns the enhancements in other water by all waves and by the drawn waves, in the shape of `factors`
-        transposed.
+    `depths`, `factors`: depths [m], and factors, of shape (`_MOST_EVENTS` + 1, `_DEPTHS`). `depth_per_length`: echo
+    depth over its path's optical length beyond the surface path. `enhancement`: enhancement by all waves, in the shape
+    of `factors`. `events`: mean number of scattering events on both ways to each depth. `enhancements`: returns the
+    enhancements in other water by all waves and by the drawn waves, in the shape of `factors` transposed.
     """
 
     def __init__(

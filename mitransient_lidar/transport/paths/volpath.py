@@ -44,8 +44,7 @@ _SOLID_GUIDING_ASYMMETRY = 0.95
 #: Radiance under water far from the emitter's direction, over the mean of all directions, that the roulette assumes.
 _DIFFUSE_RADIANCE = 0.5
 
-#: Number of the random streams within a pass.
-_STREAM = 3
+_STREAM = 3  #: Number of the random streams within a pass.
 
 BYTES_PER_PATH = 18  #: Memory per path: the state of its random numbers [bytes].
 

@@ -19,14 +19,9 @@ from mitransient_lidar.transport.perturbations import LayerChange, Perturbation
 #: Relative step for numerical derivatives of phase functions by their parameters; by a mean cosine g it is absolute.
 _STEP = 1e-4
 
-#: Step for the ripple factors, which are sample means.
-_FOCUSING_STEP = 0.02
-
-#: Longest step of a mean cosine g over 1 - |g|.
-_COSINE_SHARE = 0.25
-
-#: Largest derivative of ln p by a logarithmic parameter that counts as none: table rounding.
-_NEGLIGIBLE = 1e-6
+_FOCUSING_STEP = 0.02  #: Step for the ripple factors, which are sample means.
+_COSINE_SHARE = 0.25  #: Longest step of a mean cosine g over 1 - |g|.
+_NEGLIGIBLE = 1e-6  #: Largest derivative of ln p by a logarithmic parameter that counts as none: table rounding.
 
 
 def coefficient_derivative(water: Water, name: str, layer: int, focusing: RippleFocusing | None = None) -> Perturbation:

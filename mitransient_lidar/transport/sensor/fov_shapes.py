@@ -16,8 +16,7 @@ from mitransient_lidar.core.validation import finite, in_range, positive
 from mitransient_lidar.physics.piecewise_linear import inside_polygon
 from mitransient_lidar.transport.opaque import opaque
 
-#: Bisection steps that invert a distribution function to float32 accuracy.
-_BISECTION_STEPS = 25
+_BISECTION_STEPS = 25  #: Bisection steps that invert a distribution function to float32 accuracy.
 
 _NOT_SIMPLE = "polygon: its edges must not cross each other, nor touch or overlap"
 

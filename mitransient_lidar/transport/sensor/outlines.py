@@ -16,8 +16,7 @@ from mitransient_lidar.transport.sensor.pixels import PixelArray, ShapedPixels
 #: cell, and largest distance from simplified lines to omitted points, in cells.
 _RASTER, _BISECTIONS, _CELL_TOLERANCE = 128, 10, 0.05
 
-#: Points along each side of the raster that finds the pixels.
-_PIXEL_RASTER = 400
+_PIXEL_RASTER = 400  #: Points along each side of the raster that finds the pixels.
 
 #: Closed line, shape (n, 2).
 Outline = NDArray[np.float64]

@@ -24,17 +24,13 @@ logger = logging.getLogger(__name__)
 #: Names of the four pixels in the published receivers, in pixel order.
 PUBLISHED_NAMES = ("red", "green", "blue", "black")
 
-#: Layouts of more pixels than this are imagers by default.
-_LARGEST_LAYOUT = 16
+_LARGEST_LAYOUT = 16  #: Layouts of more pixels than this are imagers by default.
 
 #: Largest number of pixels in a receiver, and in one with rows and columns.
 MOST_PIXELS, _MOST_OF_LAYOUT = 2**20, 2**22
 
-#: Points in each pixel that find overlaps.
-_OVERLAP_POINTS = 4096
-
-#: Cells of the table along a side for each pixel along a side, and at most.
-_CELLS_PER_PIXEL, _MOST_CELLS = 8, 256
+_OVERLAP_POINTS = 4096  #: Points in each pixel that find overlaps.
+_CELLS_PER_PIXEL, _MOST_CELLS = 8, 256  #: Cells of the table along a side for each pixel along a side, and at most.
 
 
 class PixelArray(ABC):
@@ -73,19 +69,11 @@ class LayoutPixels(PixelArray):
     Points are drawn over the field of view and then assigned to pixels. The pixels thus sum, path by path, to a single
     pixel with the same field of view.
 
-    Parameters
-    ----------
-    layout
-        ``RxC``: R rows along range, row 0 the far edge (+angle_x); C columns, column 0 the left edge (+angle_y).
-        ``1x4`` is ``4x1``.
-    field_of_view
-        Diameter or side [rad], positive; of a rectangle (height along angle_x, width along angle_y).
-    shape
-        ``circle`` or ``square``; different sides make a rectangle.
-    imager
-        Whether rows and columns are separate dimensions of the result; None decides by the number of pixels.
-    fill_factor
-        Share of each cell that receives light, 0.01 to 1: a smaller rectangle about the same centre, cut by the circle.
+    `layout`: ``RxC``: R rows along range, row 0 the far edge (+angle_x); C columns, column 0 the left edge (+angle_y).
+    ``1x4`` is ``4x1``. `field_of_view`: diameter or side [rad], positive; of a rectangle (height along angle_x, width
+    along angle_y). `shape`: ``circle`` or ``square``; different sides make a rectangle. `imager`: whether rows and
+    columns are separate dimensions of the result; None decides by the number of pixels. `fill_factor`: share of each
+    cell that receives light, 0.01 to 1: a smaller rectangle about the same centre, cut by the circle.
     """
 
     sides: tuple[float, float]
@@ -287,8 +275,7 @@ def parse_layout(layout: str) -> tuple[int, int]:
     return (4, 1) if (rows, columns) == (1, 4) else (rows, columns)
 
 
-#: Integers up to this are exact in 32-bit images.
-_LARGEST_LABEL = 2**24
+_LARGEST_LABEL = 2**24  #: Integers up to this are exact in 32-bit images.
 
 
 class MappedPixels(PixelArray):
@@ -375,8 +362,6 @@ class HexPixels(PixelArray):
     `layout`: ``hexN`` with N = 1, 7, 19, 37, ... hexagons. `field_of_view`: circle diameter [rad], positive.
     `fill_factor`: share of each hexagon that receives light, 0.01 to 1: a smaller hexagon about the same centre.
 
-    Notes
-    -----
     A hexagon has the axial coordinates (column, row) with its centre at angle_x = 1.5 s row and angle_y = sqrt(3) s
     (column + row / 2).
     """

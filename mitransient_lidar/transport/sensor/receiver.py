@@ -27,8 +27,7 @@ _CORE_PER_SPREAD = 2.0
 _SETS = 4
 _OF_VIEW, _OF_VIEW_IN_IMAGES = 1, 2
 
-#: Number of pixels from which a receiver is an imager.
-IMAGE_PIXELS = 4096
+IMAGE_PIXELS = 4096  #: Number of pixels from which a receiver is an imager.
 
 
 @dataclass(frozen=True)
@@ -211,8 +210,7 @@ class Octaves:
 class PointSpread(ABC):
     """Light's displacement on the detector from one direction, against sharp optics' focus."""
 
-    #: Angle that contains all of the light but 4e-6 [rad].
-    reach: float
+    reach: float  #: Angle that contains all of the light but 4e-6 [rad].
 
     @abstractmethod
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:

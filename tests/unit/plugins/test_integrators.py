@@ -9,7 +9,7 @@ import pytest
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.transport.daylight.scene import DaylightScene
+from mitransient_lidar.transport.daylight.renderer import DaylightScene
 from mitransient_lidar.transport.scene import LidarScene
 
 FEW = {"paths_per_pass": 1024}

@@ -11,7 +11,7 @@ from significance import largest_z, variance_limits
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.gates.cut import cut_gates
-from mitransient_lidar.analysis.gates.photon_transfer import photon_transfer
+from mitransient_lidar.analysis.gates.recording import photon_transfer
 from mitransient_lidar.analysis.receiver import detect_waveforms as record
 from mitransient_lidar.analysis.recorded import describe_recording
 from mitransient_lidar.core.errors import UserError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oracles.lidar_equation import cos_water
 
-from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
+from mitransient_lidar.analysis.retrieval.surface_slope import SlopeRefraction, bottom_depth, bottom_gain, variances
 from mitransient_lidar.physics.lidar.level_sea import LidarSystem, snell
 
 THETA, N = math.radians(20), 1.34
