@@ -52,8 +52,6 @@ def write_bag(path: Path, heights: Any, first: tuple[float, float], cell: tuple[
 
 
 def height_map(suffix: str) -> Callable[[Path], Path]:
-    """Return what writes a height map."""
-
     def make(folder: Path) -> Path:
         import OpenEXR
         import rasterio
@@ -91,7 +89,6 @@ def height_map(suffix: str) -> Callable[[Path], Path]:
 
 
 def load_map(path: Path) -> None:
-    """Read a height map."""
     from mitransient_lidar.physics.sea.height_maps import read_height_map
 
     holes = "fill" if path.suffix == ".xyz" else "refuse"
@@ -99,8 +96,6 @@ def load_map(path: Path) -> None:
 
 
 def image(suffix: str) -> Callable[[Path], Path]:
-    """Return what writes a grey image."""
-
     def make(folder: Path) -> Path:
         import mitsuba as mi
 
@@ -120,7 +115,6 @@ def image(suffix: str) -> Callable[[Path], Path]:
 
 
 def read_image(path: Path) -> None:
-    """Read a grey image."""
     from mitransient_lidar.transport.sensor.image_sampling import read_image as read
 
     read("pixel_map", str(path))

@@ -189,5 +189,4 @@ def scene_of(size, gates=40, seed=3):
 
 
 def point_at(page, pixel, **how):
-    """Move the mouse to a pixel, and click there."""
     page.point("pixels", (pixel[1] + 0.5) / SIZE, (pixel[0] + 0.5) / SIZE, **how)

@@ -196,13 +196,11 @@ def _ratio(score, slope, error):
 
 
 def describe(z):
-    """Return the distribution of z as text."""
     beyond = " ".join(f"{100 * np.mean(np.abs(z) > limit):5.1f}" for limit in (2, 3))
     return f"{z.size:5} {np.sqrt(np.mean(z**2)):5.2f} {beyond} {np.abs(z).max():5.1f}"
 
 
 def main():
-    """Compare the cases and print a row for each parameter."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", choices=CASES, action="append", help="by default all")
     parser.add_argument("--integrator", choices=SAMPLES, action="append", help="by default both")

@@ -119,7 +119,6 @@ def _build(*, integrator=None, tx=None, rx=None, film=None, sea=None, water=None
 
 @pytest.fixture
 def lidar_scene():
-    """Builder of scenes; see `_build`."""
     return _build
 
 

@@ -175,7 +175,6 @@ def set_extreme(path: Path, rng: random.Random) -> None:
 
 
 def _one_of(folder: Path, rng: random.Random) -> Path:
-    """Return a file of a folder."""
     return rng.choice(sorted(one for one in folder.rglob("*") if one.is_file()))
 
 
@@ -280,7 +279,6 @@ def _too_long(*_: object) -> None:
 
 
 def _place(error: BaseException) -> str:
-    """Return the last place of this package in a traceback."""
     own = [frame for frame in traceback.extract_tb(error.__traceback__) if "/mitransient_lidar/" in frame.filename]
     return f"at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
 
@@ -318,7 +316,6 @@ def measure(name: str, first: int, count: int, folder: Path) -> Counter[str]:
 
 
 def main() -> None:
-    """Read damaged files, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="KIND", help=f"kinds of files; default: all of {', '.join(KINDS)}")
     parser.add_argument("--count", type=int, default=0, help="number of damaged files of each kind")

@@ -95,7 +95,6 @@ def run(case, count, receiver, first):
 
 
 def main():
-    """Read the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", choices=CASES, default="column")
     parser.add_argument("--count", type=int, default=25)

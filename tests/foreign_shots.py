@@ -92,7 +92,6 @@ def fit_foreign(instrument, number, folder, passes=MODEL_PASSES, **options):
 
 
 def main():
-    """Read the command line, fit, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--count", type=int, default=5, help="shots of each instrument")

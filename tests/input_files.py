@@ -25,7 +25,6 @@ class Kind(NamedTuple):
 
 
 def shot() -> Any:
-    """Return a small result, rendered once."""
     import mitransient_lidar
 
     params = {"layout": "2x2", "time_start_ns": 1400, "bin_count": 150, "spectrum": "flat"}
@@ -33,15 +32,12 @@ def shot() -> Any:
 
 
 def series() -> Any:
-    """Return a small series of shots."""
     import mitransient_lidar
 
     return mitransient_lidar.render_shots("table1", params={"layout": "2x2"}, count=3, passes=2)
 
 
 def saved(dataset: Callable[[], Any], name: str) -> Callable[[Path], Path]:
-    """Return what writes a result."""
-
     def make(folder: Path) -> Path:
         from mitransient_lidar import results
 
@@ -52,8 +48,6 @@ def saved(dataset: Callable[[], Any], name: str) -> Callable[[Path], Path]:
 
 
 def written(name: str, text: str) -> Callable[[Path], Path]:
-    """Return what writes a text."""
-
     def make(folder: Path) -> Path:
         (folder / name).write_text(text)
         return folder / name
@@ -109,7 +103,6 @@ def _each(*uses: Callable[[], object]) -> None:
 
 
 def scene(folder: Path) -> Path:
-    """Write a self-contained scene."""
     from mitransient_lidar.loading.catalogue import copy_scene
 
     return copy_scene("fig13_2x2", folder / "scene.xml")
@@ -178,8 +171,6 @@ _SPECTRUM = "".join(f"{wavelength} {0.1 + wavelength / 1e4:.4f}\n" for wavelengt
 
 
 def gates(name: str) -> Callable[[Path], Path]:
-    """Return what writes a gate stack."""
-
     def make(folder: Path) -> Path:
         import mitransient_lidar
         from mitransient_lidar import results
@@ -191,7 +182,6 @@ def gates(name: str) -> Callable[[Path], Path]:
 
 
 def draw_gates(path: Path) -> None:
-    """Open and draw a gate stack."""
     from mitransient_lidar import results
     from mitransient_lidar.plots.gates.images import plot_gates
 
@@ -218,7 +208,6 @@ seed = 3
 
 
 def plan(path: Path) -> None:
-    """Read a campaign, and plan its runs."""
     from mitransient_lidar.campaigns.design import Campaign
     from mitransient_lidar.campaigns.runs import RunRenderer
 
@@ -227,13 +216,11 @@ def plan(path: Path) -> None:
 
 
 def table_of_runs(folder: Path) -> Path:
-    """Write the table of a campaign."""
     (folder / "runs.csv").write_text("attenuation,bottom_depth,layout\n0.2,4.5,2x2\n0.3,5,1x1\n0.35,5.5,2x2\n")
     return folder / "runs.csv"
 
 
 def plan_table(path: Path) -> None:
-    """Plan the runs of a table."""
     from mitransient_lidar.campaigns.design import Campaign
     from mitransient_lidar.campaigns.runs import RunRenderer
 
@@ -243,7 +230,6 @@ def plan_table(path: Path) -> None:
 
 
 def store(folder: Path) -> Path:
-    """Render a small campaign."""
     from mitransient_lidar.campaigns.sweep import campaign as run_campaign
 
     fixed = {"spectrum": "flat", "layout": "1x1", "time_start_ns": 1380, "bin_count": 160}
@@ -293,7 +279,6 @@ lever_arm = [0.3, 1.2, -0.5]
 
 
 def fly(path: Path) -> None:
-    """Work out the pulses of a flight."""
     from mitransient_lidar.core.files import read_text
     from mitransient_lidar.core.formats.documents import check_keys, parse_toml, required, table
     from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
@@ -310,7 +295,6 @@ def fly(path: Path) -> None:
 
 
 def sbet(folder: Path) -> Path:
-    """Write an SBET file."""
     data = np.zeros((9, 17))
     data[:, 0], data[:, 3] = 345600 + np.arange(9) / 200, 350.0
     data[:, 1:3] = np.radians([60.0, 15.0]) + 1e-7 * np.arange(9)[:, None]
@@ -345,8 +329,6 @@ _PROFILE = """depth (m),attenuation (1/m),scattering (1/m)
 
 
 def load_plugin(**parameters: str) -> Callable[[Path], None]:
-    """Return what loads a plugin with a file."""
-
     def read(path: Path) -> None:
         import mitsuba as mi
 
@@ -360,8 +342,6 @@ def load_plugin(**parameters: str) -> Callable[[Path], None]:
 
 
 def shipped(name: str) -> Callable[[Path], Path]:
-    """Return what copies a file of an instrument."""
-
     def make(folder: Path) -> Path:
         from mitransient_lidar.loading.catalogue import folder_of_scenes
 
@@ -371,21 +351,18 @@ def shipped(name: str) -> Callable[[Path], Path]:
 
 
 def read_receiver(path: Path) -> None:
-    """Read a receiver."""
     from mitransient_lidar.physics.receiver.receiver_files import receiver
 
     receiver(str(path))
 
 
 def read_corrections(path: Path) -> None:
-    """Read a table of corrections."""
     from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 
     corrections_for("", path)
 
 
 def read_measured(path: Path) -> None:
-    """Read measured waveforms."""
     from mitransient_lidar.analysis.information.measured import measured
 
     measured(path)

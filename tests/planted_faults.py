@@ -475,7 +475,6 @@ def measure(
 
 
 def main() -> None:
-    """Measure, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="faults to plant; default: all")
     parser.add_argument("--check", action="store_true", help="check that all faults apply, and run no tests")

@@ -77,7 +77,6 @@ CASES = {
 
 
 def tier_of(name, integrator):
-    """Return the marks of a case."""
     if name == QUICK:
         return []
     # The quick case has both integrators; the mast differs from it the most, in the phase function as well.
@@ -85,7 +84,6 @@ def tier_of(name, integrator):
 
 
 def both_in(names):
-    """Return the mark of a test of both integrators in some cases."""
     both = [(name, integrator) for integrator in INTEGRATORS for name in names]
     cases = [pytest.param(*each, marks=tier_of(*each)) for each in both]
     return pytest.mark.parametrize(("case", "integrator"), cases, indirect=["case"])

@@ -39,7 +39,6 @@ def slopes(name, params, steps=None):
 
 
 def axis_of(session):
-    """Return the time bins of a scene."""
     return find_lidar_scene(session.scene, session.sensor).axis
 
 
@@ -51,7 +50,6 @@ def each_energy(session, integrator=SMALL, seed=OTHERS, axis=None):
 
 
 def energies(session, seed=OTHERS, axis=None):
-    """Return energies [J], a row for each pass."""
     return each_energy(session, seed=seed, axis=axis).sum(axis=1)
 
 

@@ -41,7 +41,6 @@ def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes):
 
 
 def with_total(energy):
-    """Append the sum over the bins as a last column."""
     return np.concatenate([energy, energy.sum(axis=1, keepdims=True)], axis=1)
 
 

@@ -48,7 +48,6 @@ def half_space(lidar_scene, degrees, albedo, view, beam, integrator):
 
 
 def returned(lidar_scene, passes, count, degrees, albedo, view, beam, integrator):
-    """Return the energy [J] of `count` passes of a half-space."""
     scene = half_space(lidar_scene, degrees, albedo, view, beam, integrator)
     # Energies go with the solid angle that is seen.
     return passes(scene, count)[:, 0, 0] * (beam / view) ** 2

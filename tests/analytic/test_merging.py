@@ -282,7 +282,6 @@ OTHER_STRATA |= {"plume_scattering": 0.7, "plume_width": 6, "plume_depth": 1.5, 
 
 
 def kernels_of_pass(scene, sensor, integrator):
-    """Return the kernels that a pass of few paths launches."""
     renderer = choose_integrator(scene, integrator).prepare(scene, sensor)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()

@@ -15,7 +15,6 @@ SMOOTH = {"slope_variance": "2e-5"}
 
 
 def plate(bsdf):
-    """Return a plate 1 cm above the bottom."""
     to_world = mi.ScalarTransform4f().translate([0, 0, -3.99]).scale(100)
     return {"plate": {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}}
 
@@ -26,7 +25,6 @@ def canopy(leaf_width, reflectance, transmittance, **parameters):
 
 
 def echo(lidar_scene, passes, integrator, count, extra, off_nadir=0.0, water=CLEAR, sea=SMOOTH, **paths):
-    """Return the light of passes from below the surface of 4 m of water."""
     photons = {
         name: number for name, number in paths.items() if integrator == INTEGRATORS[0] or name != "photons_per_pass"
     }

@@ -14,7 +14,6 @@ WATER = {"layer_tops": "0, 2, 5", "refractive_index": "1.34, 1.6, 1.2", "group_i
 
 
 def few(integrator):
-    """Return the parameter of photons of the integrator that has them."""
     return {"photons_per_pass": 2**13} if integrator == "lidar_merging" else {}
 
 

@@ -69,7 +69,6 @@ def gain(x, y, z, lidar=LIDAR, sigma=SIGMA):
 
 
 def grid(low, high, count):
-    """Return midpoints and spacing."""
     step = (high - low) / count
     return low + step * (np.arange(count) + 0.5), step
 

@@ -108,7 +108,6 @@ def test_scenes_of_python_give_the_same_bits_with_their_files_alone(own, folder)
 @pytest.mark.slow
 @pytest.mark.parametrize("place", ["first"])
 def test_a_camera_beside_the_receiver_is_left_alone(own, tmp_path, place):
-    """Before the receiver it was taken for it, and its film could not be recorded."""
     looking = mi.ScalarTransform4f().look_at([0, 0, 90], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 8, "height": 6, "pixel_format": "luminance"}
     camera = {"camera": {"type": "perspective", "to_world": looking, "film": film}}
@@ -125,7 +124,6 @@ def test_a_camera_beside_the_receiver_is_left_alone(own, tmp_path, place):
 @pytest.mark.slow
 @pytest.mark.parametrize("function", [mitransient_lidar.render])
 def test_a_result_of_another_receiver_gives_the_same_bits(function, tmp_path):
-    """The first one was rendered, whatever was asked for."""
     poses = '<float name="aim_x" value="$aim_x"/><float name="aim_y" value="$aim_y"/>'
     receivers = "".join(
         f'<sensor type="multipixel_receiver" id="{name}"><string name="layout" value="1x{number}"/>{poses}'

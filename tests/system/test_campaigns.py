@@ -185,7 +185,6 @@ def shard_code(monkeypatch, arrays, start="pass"):
 
 @pytest.mark.slow
 def test_an_error_of_the_program_is_told_and_its_run_stays_planned(quick, tmp_path, monkeypatch):
-    """It once was tried twice, and stored as a failure of the run without its traceback."""
     path = planned_copy(quick, tmp_path / "bug.zarr")
     shard_code(monkeypatch, "{}[3] if number == 8 else arrays(self, number, values)")
     assert shards.render_in_process(str(path), 1) == (5, 0, "run 8: KeyError: 3")
@@ -198,7 +197,6 @@ def test_an_error_of_the_program_is_told_and_its_run_stays_planned(quick, tmp_pa
 @pytest.mark.long
 @pytest.mark.parametrize("deaths", [2, 3])
 def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch, deaths):
-    """Twice; it once ended the campaign."""
     path = planned_copy(quick, tmp_path / "early.zarr")
     (tmp_path / "deaths").mkdir()
     place = str(tmp_path / "deaths")
@@ -211,7 +209,6 @@ def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch
 
 @pytest.mark.slow
 def test_shards_that_cannot_be_rendered_are_left(quick, tmp_path, monkeypatch):
-    """The command says which ones to look at."""
     path = planned_copy(quick, tmp_path / "left.zarr")
     monkeypatch.setattr(workers, "render_in_process", lambda path, shard, *_: shards.Outcome(0, 0, "shard 0: lost"))
     with pytest.raises(UserError, match=r"2 of 2 shards are not complete, .* shard 0: lost; .*left\.zarr\.log"):
@@ -258,7 +255,6 @@ except KeyboardInterrupt as error:
 
 @pytest.mark.long
 def test_nothing_listens_on_a_port(quick, tmp_path):
-    """Any user of the machine could once run code through the scheduler of a campaign."""
     psutil = pytest.importorskip("psutil")
     path, seen = planned_copy(quick, tmp_path / "closed.zarr"), []
 
@@ -276,7 +272,6 @@ def test_nothing_listens_on_a_port(quick, tmp_path):
 
 @pytest.mark.long
 def test_a_script_without_a_main_guard_that_is_interrupted_keeps_runs_of_its_shard(campaign, tmp_path):
-    """It once ended in 193 lines of tracebacks; and what a process had rendered in the last minute was lost."""
     path, script = tmp_path / "out.zarr", tmp_path / "script.py"
     script.write_text(SCRIPT)
     many = {**campaign, "design": {**campaign["design"], "count": 500}}

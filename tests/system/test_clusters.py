@@ -137,7 +137,6 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
 
 @pytest.mark.long
 def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
-    """The campaign once waited for ever."""
     path = planned_copy(quick, tmp_path / "unreachable.zarr")
     nowhere = "tcp://127.0.0.1:9"
     command = worker_command(scheduler[1], tmp_path)
@@ -152,7 +151,6 @@ def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
 
 @pytest.mark.long
 def test_a_process_that_hangs(quick, tmp_path, monkeypatch):
-    """The campaign once waited for ever, and later stored a run in which processes hung as failed."""
     path = planned_copy(quick, tmp_path / "hung.zarr")
     monkeypatch.setattr(shards, "_LOOK_S", 0.2)
     processes, alarms = shards.Processes(), []
@@ -184,7 +182,6 @@ def test_a_process_that_hangs(quick, tmp_path, monkeypatch):
     ],
 )
 def test_a_process_hangs_that_neither_computes_nor_waits_for_a_disk(state, error, hangs, monkeypatch, caplog):
-    """One that waited for a server's disk was killed, and an error of the watch was silent."""
     looks, enough = [], threading.Event()
 
     def cpu_times():
@@ -224,7 +221,6 @@ OTHERS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["0.1.9"])
 def test_workers_of_other_versions_are_refused(quick, tmp_path, scheduler, kind):
-    """Half of a store once had the numbers of another version."""
     path = planned_copy(quick, tmp_path / "other.zarr")
     with subprocess.Popen(worker_command(scheduler[1], tmp_path, OTHERS[kind][0]), **SILENT) as worker:
         text = rf"the worker at tcp://127\.0\.0\.1:\d+ has {re.escape(OTHERS[kind][1])}: all that"
@@ -248,8 +244,6 @@ def test_the_process_of_a_shard_compares_versions_too(quick, tmp_path):
 
 @pytest.mark.slow
 def test_other_servers_than_schedulers(quick):
-    """An HTTP server once gave a traceback, and 40 s."""
-
     def serve():
         with contextlib.suppress(OSError):  # of the server's end
             while True:

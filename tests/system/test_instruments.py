@@ -30,7 +30,6 @@ def record(name):
 
 
 def few(scene, integrator=FEW, **options):
-    """Render a few paths over a flat sea."""
     params = {"spectrum": "flat", **options.pop("params", {})}
     return mitransient_lidar.render(scene, params=params, integrator=integrator, passes=2, **options)
 

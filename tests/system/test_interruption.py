@@ -107,7 +107,6 @@ app.main()
     ],
 )
 def test_a_signal_after_the_last_file_ends_as_any_other(number, code):
-    """Ctrl-C once gave a traceback and exit code 0."""
     process = start(LATE, int(number), "scenes", "list", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     stdout, stderr = process.communicate(timeout=240)
     assert (process.returncode, stderr) == (code, "")
@@ -116,7 +115,6 @@ def test_a_signal_after_the_last_file_ends_as_any_other(number, code):
 
 @pytest.mark.slow
 def test_a_render_with_closed_streams_writes_its_files_and_nothing_into_them(tmp_path):
-    """It once wrote nothing, with exit code 2; files took the number of stderr, which libraries write to."""
     coarse = ["-D", "surface_size=60", "-D", "surface_cell_size=0.5"]
     command = ["sh", "-c", '"$@" <&- >&- 2>&-', "sh", sys.executable, "-m", "mitransient_lidar", *RENDER, *coarse]
     done = subprocess.run([*command, "--passes", "2", "-o", str(tmp_path)], capture_output=True, text=True, check=True)

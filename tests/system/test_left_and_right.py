@@ -31,7 +31,6 @@ def echo_ns(dataset):
 
 
 def near_echo(dataset):
-    """Return whether bins may hold the target's echo."""
     return np.abs(dataset["time"] - echo_ns(dataset)) < 8
 
 

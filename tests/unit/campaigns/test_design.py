@@ -164,7 +164,6 @@ def test_invalid_campaigns(sections, message):
     ],
 )
 def test_tables_are_refused_before_they_take_memory(parameters, design, message):
-    """94 ranges of ten million runs took 15 GB, and a grid all values of its ranges."""
     campaign = Campaign.of_file(
         {"scene": "table1", "parameters": {f"p{i}": RANGE for i in range(parameters)}, "design": design}
     )

@@ -82,7 +82,6 @@ def out_of_space(*_, **__):
 
 
 def filled(store, shard, value):
-    """Return what is written of a shard with equal values."""
     status, errors, arrays = store.read(shard)
     return status, errors, {name: np.full_like(array, value) for name, array in arrays.items()}
 
@@ -156,7 +155,6 @@ def test_status_is_written_last(store, path, monkeypatch):
 
 
 def flip(path):
-    """Flip a bit in the middle of a file."""
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 4
     path.write_bytes(data)
@@ -170,7 +168,6 @@ CHUNKS = ["waveform/c/1/0/0/0", "echo_flags/c/1/0/0", "error/c/1", "status/c/1",
     [*((chunk, flip) for chunk in CHUNKS), (CHUNKS[0], Path.unlink), (CHUNKS[1], lambda path: path.write_bytes(b""))],
 )
 def test_damaged_shards_are_planned_again(full, path, caplog, chunk, damage):
-    """Three flipped bits, or a missing chunk, once gave other numbers of runs that are done."""
     damage(path / chunk)
     store = Store(path)
     store.mend()
@@ -292,7 +289,6 @@ def test_size_of_shards(tmp_path):
 
 
 def test_shards_of_all_workers_are_within_the_memory(store, monkeypatch):
-    """One shard was: each worker has one."""
     monkeypatch.setattr(validation, "usable_memory", lambda: 2000.0)
     rendered = []
     monkeypatch.setattr(sweep, "on_this_machine", lambda few, *_: contextlib.nullcontext(few))
@@ -305,7 +301,6 @@ def test_shards_of_all_workers_are_within_the_memory(store, monkeypatch):
 
 @pytest.mark.parametrize("name", ["zarr.json", "waveform", "waveform/zarr.json", "status/c/0"])
 def test_links_in_a_store_are_not_followed(store, path, tmp_path, name):
-    """They would lead to any file of whoever opens the store, and `mend` would write to it."""
     status, errors, arrays = filled(store, 0, 1)
     status[:] = DONE
     store.write(0, status, errors, arrays)

@@ -37,7 +37,6 @@ def scene(tmp_path, monkeypatch):
 
 @pytest.fixture
 def calls(monkeypatch):
-    """Replace the renderer; return what it was called with."""
     seen = []
     extra = {}
 
@@ -83,7 +82,6 @@ def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
 
 @each_row("quiet", [True, False])
 def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path, monkeypatch, caplog):
-    """They once were shown after its report, and earlier, those of the program that called it were silent, too."""
     logger = logging.getLogger("mitransient_lidar")
     before = logger.propagate, logger.level, [*logger.handlers]
     monkeypatch.setattr("mitransient_lidar.results.dataset_of", lambda *_: logger.warning("early") or xr.Dataset())
@@ -104,7 +102,6 @@ def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path
     ],
 )
 def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, describe, plot, monkeypatch, tmp_path):
-    """Their drawings are of the passes until then; the exit code was once 0."""
     study = COMMANDS[command].function.partition(":")[0]
     stub(monkeypatch, command, lambda **_: xr.Dataset(attrs={"interrupted": 1, "passes": 3}))
     monkeypatch.setattr(f"mitransient_lidar.{study}.{describe}", lambda _: ["lines"])
@@ -127,8 +124,6 @@ def test_interruption_elsewhere_leaves_nothing_and_a_bug_is_not_taken_for_a_mist
 
 
 def test_a_disk_without_space_for_the_last_picture_leaves_the_former_files(scene, calls, tmp_path, monkeypatch):
-    """Its sentence once passed for one of pixels that do not see the sea, with exit code 0 and a stale picture."""
-
     def full(dataset, path):
         with replacing(path):
             raise OSError(errno.ENOSPC, "full")

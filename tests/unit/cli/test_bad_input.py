@@ -209,12 +209,10 @@ def test_scene_files(tmp_path, folder, change, part):
 
 
 def quietly(**options):
-    """Return a call of render with two passes of table1 unless other options are given."""
     return lambda: mitransient_lidar.render(**{"scene": "table1", "passes": 2, **options})
 
 
 def as_dict(**parts):
-    """Return a call of render for a scene given as a dict."""
     return quietly(scene={"type": "scene", **parts})
 
 

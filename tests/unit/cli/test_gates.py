@@ -15,7 +15,6 @@ TRAIN = ("--start-ns", 1480, "--width-ns", 5, "--count", 6)
 
 @pytest.fixture
 def stored(tmp_path):
-    """A small imager's result, in a file."""
     dataset = result(12, (3, 4), pulse_fwhm_ns=4.0)
     results.save(dataset, tmp_path / "scene.nc")
     return tmp_path / "scene.nc", dataset

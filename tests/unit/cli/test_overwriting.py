@@ -95,7 +95,6 @@ FILES = [(name, file) for name, (_, targets, _) in CASES.items() for file in tar
 
 
 def words(name):
-    """Return the words of a case's command."""
     return name if name in COMMANDS else name.split()[0]
 
 
@@ -116,7 +115,6 @@ def folder(tmp_path, monkeypatch, small_result):
 
 @pytest.fixture(scope="module")
 def small_result(tmp_path_factory):
-    """A result, as a script saves it."""
     path = tmp_path_factory.mktemp("result") / "shot.nc"
     results.save(synthetic_shots.result(scene="table1"), path)
     return path
@@ -149,7 +147,6 @@ def write_before(monkeypatch):
 
 
 def change_mark(path, **values):
-    """Write a file anew with another mark."""
     mark = {**read_mark(path), **values}
     path.write_bytes(b"contents \0\0\0\0IEND startxref ;")
     write_mark(path, mark)

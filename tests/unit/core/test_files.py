@@ -142,7 +142,6 @@ def test_leftovers_of_a_dead_process_are_removed(tmp_path, dead):
 
 
 def test_no_leftover_moves_or_removes_a_file_of_another_name(tmp_path, dead):
-    """A list of moves once did, in any folder that a command wrote into; a link would reach another folder."""
     victim = tmp_path / "victim"
     victim.mkdir()
     (victim / "a").write_text("old")

@@ -26,7 +26,6 @@ def picture():
 
 @pytest.fixture(params=[*FIGURES, ".gif", ".html", ".nc"])
 def file(request, tmp_path):
-    """A file of each format that Python alone writes."""
     path = tmp_path / f"file{request.param}"
     if request.param in FIGURES:
         picture().savefig(path)
@@ -41,7 +40,6 @@ def file(request, tmp_path):
 
 
 def contents(path):
-    """Return what a reader of the format sees."""
     if path.suffix in (".png", ".gif"):
         with Image.open(path) as image:
             frames = []

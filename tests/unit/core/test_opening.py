@@ -50,7 +50,6 @@ def other(request, tmp_path, monkeypatch):
 
 @each_row("read", [open_file, check_regular, read_text, read_npy])
 def test_only_regular_files_are_opened(other, read):
-    """Before, a named pipe made each of them wait for ever, and a device had no end."""
     path, reason = other
     with pytest.raises(UserError, match=reason) as caught:
         read(path)

@@ -21,7 +21,6 @@ FOLDER = Path(__file__).parents[3] / "docs" / "intercomparison"
 
 
 def script(name):
-    """Return a script of the intercomparison as a module."""
     spec = importlib.util.spec_from_file_location(f"intercomparison_{name}", FOLDER / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
@@ -41,7 +40,6 @@ WATER = (
 
 
 def values(element):
-    """Return the parameters of an element of a scene, as text."""
     return {child.get("name"): child.get("value") for child in element if child.get("value") is not None}
 
 

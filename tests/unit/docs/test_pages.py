@@ -21,7 +21,6 @@ def is_generated(path: Path) -> bool:
 
 
 def pages() -> list[Path]:
-    """Return the pages that are written by hand."""
     found = [path for suffix in ("md", "rst") for path in DOCS.rglob(f"*.{suffix}")]
     return [page for page in found if page.relative_to(DOCS).parts[0] not in _SOURCES and not is_generated(page)]
 

@@ -61,7 +61,6 @@ def points() -> xr.Dataset:
 
 @pytest.fixture
 def waveforms() -> xr.Dataset:
-    """Counts of each pixel of each shot."""
     counts = np.random.default_rng(6).integers(0, 4096, (SHOTS * PIXELS, SAMPLES)).astype(np.uint16)
     return waveform_dataset(counts)
 

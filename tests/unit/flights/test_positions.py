@@ -82,7 +82,6 @@ def located(made, *, origin, axis, far, left, **options):
 
 
 def found(points, kind):
-    """x, y and z of the points of a class."""
     return np.stack([points[name].values[points["kind"].values == kind] for name in "xyz"], axis=-1)
 
 

@@ -12,7 +12,6 @@ FLAT = {"spectrum": "flat"}
 
 
 def load(scene="table1", **params):
-    """Return the water, the transmitter and the parameters of a shipped scene."""
     opened = open_scene(scene, {**FLAT, **params})
     loaded, parameters = opened.scene, opened.parameters
     water = next(shape.interior_medium().water for shape in loaded.shapes() if hasattr(shape, "sea"))

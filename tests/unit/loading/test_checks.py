@@ -128,7 +128,6 @@ def test_libraries_in_resources_of_a_dict_or_the_current_folder_are_refused(tmp_
 
 @each_row("plugin", ["blender", "serialized", "irregular", "polarizer", "homogeneous", "point"])
 def test_plugins_that_a_lidar_scene_cannot_have_are_refused(plugin, tmp_path):
-    """A polariser was left out as if it had no effect."""
     with pytest.raises(UserError, match=f"type = '{plugin}' is not loaded"):
         open_scene({"type": "scene", "shape": {"type": plugin, "filename": "a"}})
     path = tmp_path / "scene.xml"

@@ -38,14 +38,12 @@ SEA = """<scene version="3.0.0">
 
 
 def parts(loaded):
-    """Return transmitter and receiver of a scene."""
     transmitter = next(each for each in loaded.emitters() if hasattr(each, "pulse"))
     (sensor,) = loaded.sensors()
     return transmitter, sensor.receiver
 
 
 def values(name):
-    """Return the values of an instrument by their names, without empty ones."""
     return {each.name: each.value for each in catalogue.read_instrument(name).parameters if each.value}
 
 

@@ -36,7 +36,6 @@ def with_index(path, index):
 
 @pytest.mark.parametrize("index", [4, 2_000_000_000, -5, 2**31 - 1])
 def test_faces_without_a_vertex_are_refused(square, index):
-    """2 000 000 000 ended the process by a signal, -5 was read from other places of the memory."""
     with_index(square, index)
     scene = {"type": "scene", "mesh": {"type": "ply", "filename": str(square)}}
     with pytest.raises(UserError, match=f"has a face with the vertex {index}, and the vertices 0 to 3 alone"):
@@ -78,7 +77,6 @@ def test_headers_that_lie_are_refused(square, old, new):
 
 
 def test_a_message_that_quotes_other_bytes_than_text_is_a_sentence(tmp_path):
-    """Python's binding cannot decode what Mitsuba says of the line, and raised UnicodeDecodeError."""
     path = mesh("a.obj")(tmp_path)
     path.write_bytes(path.read_bytes() + b"v 1 \xf6 2\n")
     with pytest.raises(UserError, match="could not parse line") as caught:
@@ -117,7 +115,6 @@ def test_checks_agree_with_what_mitsuba_reads(tmp_path, order):
 
 @pytest.mark.parametrize("kind", ["gridvolume", "sdfgrid"])
 def test_grids_of_other_sizes_than_their_header_says_are_refused(tmp_path, kind):
-    """2^30 cells along each side overflowed to none, and were read from other places of the memory."""
     path = tmp_path / "grid.vol"
     mi.VolumeGrid(np.linspace(-0.5, 0.5, 24, dtype=np.float32).reshape(2, 3, 4, 1)).write(str(path))
     grid = {"type": kind, "filename": str(path)}

@@ -34,7 +34,6 @@ def volume(**given):
     ids=lambda texture: "-".join(map(str, texture)),
 )
 def test_textures_of_python_are_restored(texture):
-    """They were not stored, so that no result of such a scene was rendered again."""
     solid = {"type": "cube", "to_world": BOX, "bsdf": {"type": "diffuse", "reflectance": texture}}
     loaded = open_scene({"solid": solid})
     again = open_scene(SceneSource.from_attributes(loaded.source.attributes()))

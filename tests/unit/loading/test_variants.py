@@ -98,7 +98,6 @@ print(value.numpy().tobytes().hex())
 
 @pytest.fixture
 def rgb():
-    """Another variant, which the plugins do not support."""
     ours = mi.variant()
     mi.set_variant("scalar_rgb")
     yield "scalar_rgb"

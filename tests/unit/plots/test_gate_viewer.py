@@ -18,7 +18,6 @@ ROWS, COLUMNS, GATES, BINS = 30, 21, 40, 120
 
 @pytest.fixture(scope="module")
 def scene():
-    """Stack and render of random numbers."""
     rng = np.random.default_rng(5)
     angles = {
         "angle_x": (("row", "column"), np.repeat(np.linspace(3, -3, ROWS)[:, None], COLUMNS, 1)),

@@ -64,7 +64,6 @@ def test_red_and_green_of_equal_lightness_are_not_told_apart():
 
 
 def looks(line):
-    """Return colour, and line style and marker, of a line."""
     dashes = line._dash_pattern[1] if line.get_linestyle() != "None" else "no line"
     return to_hex(line.get_color()), (None if dashes is None else str(dashes), str(line.get_marker()))
 

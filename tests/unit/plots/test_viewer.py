@@ -62,7 +62,6 @@ def test_the_command_refuses_what_it_cannot_show(result, opened, tmp_path):
 
 
 def test_temporary_pages_of_former_calls_are_removed(result, opened, tmp_path):
-    """They once stayed for ever; those of the last hour may have a browser that has not read them."""
     paths = [Path(run("view", file).stdout.strip()) for file in [saved(result, tmp_path)] * 2]
     assert all(path.is_file() for path in paths)
     old = paths[0].stat().st_mtime - 3700
@@ -77,6 +76,5 @@ def test_temporary_pages_of_former_calls_are_removed(result, opened, tmp_path):
 
 
 def saved(result, folder):
-    """Write a result, and return its path."""
     results.save(result, folder / "shot.nc")
     return folder / "shot.nc"

@@ -97,7 +97,6 @@ def test_gradients_are_refused(lidar_scene, name):
 
 
 def living():
-    """Return the number of prepared scenes in memory."""
     gc.collect()
     return sum(isinstance(one, LidarScene | DaylightScene) for one in gc.get_objects())
 

@@ -16,8 +16,6 @@ BRIGHT |= {"integrator": {"type": "lidar_volpath", "paths_per_pass": 2**14}}
 
 @pytest.fixture
 def png(tmp_path):
-    """Function that writes an image and returns its path."""
-
     def write(values, name="map.png"):
         path = tmp_path / name
         if name.endswith(".npy"):
@@ -31,8 +29,6 @@ def png(tmp_path):
 
 
 class OnePixel:
-    """The pixels of an array as a single pixel."""
-
     def __init__(self, pixels):
         self._pixels, self.names, self.grid = pixels, ["single"], None
         self.count, self.area, self.sample = 1, pixels.area, pixels.sample

@@ -111,7 +111,6 @@ def test_the_progress_line_names_the_request_and_its_forecast():
 
 @pytest.mark.parametrize(("at", "kept"), [(2, False), (4, True)])
 def test_an_interruption_waits_for_its_pass_alone(monkeypatch, at, kept):
-    """One during the passes that a result needs was once ignored until their end."""
     clock = Clock(monkeypatch, 1.0)
 
     def render_pass(number, seed):

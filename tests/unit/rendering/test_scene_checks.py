@@ -19,7 +19,6 @@ BALL = {"type": "sphere", "radius": 0.5}
 
 
 def check(scene, caplog, integrator="lidar_merging"):
-    """Return what the checks of a scene tell."""
     renderer = mi.load_dict({"type": integrator}).prepare(scene, scene.sensors()[0])
     with caplog.at_level(logging.INFO, "mitransient_lidar.rendering.scene_checks"):
         check_scene(renderer.probe)

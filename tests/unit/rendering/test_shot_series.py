@@ -235,7 +235,6 @@ def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     [(single, "render", "render"), (single, "render_again", "render"), (shot_series, *["render_shots"] * 2)],
 )
 def test_an_interruption_of_the_first_of_two_channels_ends_the_render(monkeypatch, module, name, called):
-    """The other channel was once rendered to its end, though there was nothing to join it to."""
     calls = []
     function = getattr(module, name)
     monkeypatch.setattr(module, called, lambda *_, **__: calls.append(called) or xr.Dataset(attrs={"interrupted": 1}))

@@ -45,7 +45,6 @@ def test_series_share_their_shots():
 
 
 def test_an_interruption_of_either_channel_is_one_of_both():
-    """The exit code of a series whose infrared channel was interrupted was once 0."""
     whole, ended = (result(9, 532.0).assign_attrs(interrupted=number) for number in (0, 1))
     for channels, expected in (((whole, whole), 0), ((whole, ended), 1), ((ended, whole), 1)):
         assert join(*channels).attrs["interrupted"] == expected

@@ -54,7 +54,6 @@ def test_more_than_ten_thousand_bins_have_five_digits(tmp_path):
 
 @pytest.mark.slow
 def test_channels_beyond_the_memory_leave_the_other_files(tmp_path, monkeypatch):
-    """A million bins took 10 GB of memory, after their render."""
     monkeypatch.setattr(validation, "usable_memory", lambda: 1e6)
     with pytest.raises(UserError, match=r"2000 channels of an EXR file take 0.005 GB of memory, and at most 0.001 GB"):
         results.save(light(np.zeros((1, 1, 500))), tmp_path / "a.exr")

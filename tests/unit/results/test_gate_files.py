@@ -50,7 +50,6 @@ def make(rows=4, columns=5, gates=3, attributes=ATTRIBUTES, seed=7):
 
 
 def save_sequence(stack, folder, stem):
-    """Write a sequence, and return its files."""
     exr.write_sequence(check_stack(stack), folder, stem)
     return [folder / f"{stem}_gate{k:03d}.exr" for k in range(stack.sizes["gate"])]
 

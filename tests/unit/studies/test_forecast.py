@@ -143,7 +143,6 @@ def test_raised_bottoms_have_the_light_of_their_depth():
 
 @pytest.mark.slow
 def test_an_interrupted_render_ends_the_forecast(monkeypatch):
-    """Once, the forecast went on with the shots until then."""
     monkeypatch.setattr(study, "render_shots", lambda *_, **__: xr.Dataset(attrs={"interrupted": 1}))
     with pytest.raises(KeyboardInterrupt):
         study._Bottoms("published_airborne", "table1", {"jerlov": "III"}, None, 6, 1, 3)._merged(9.0)

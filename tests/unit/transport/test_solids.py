@@ -97,7 +97,6 @@ def test_instance_returns_the_light_of_what_it_repeats(lidar_scene, integrator):
     ],
 )
 def test_bsdfs_that_cannot_be_evaluated_are_refused(lidar_scene, bsdf, told):
-    """The first two ended in a traceback, and the last one was black."""
     scene = lidar_scene(extra={"ball": {"type": "sphere", "radius": 0.1, "bsdf": bsdf}})
     with pytest.raises(UserError, match=f"shape 'ball'.*{told}"):
         find_lidar_scene(scene, scene.sensors()[0])

@@ -41,7 +41,6 @@ def waveforms(peak=2e-8, rows=6, columns=8):
 
 
 def stack(peak=2e-8, step=1.0, count=60, pulses=100, **shape):
-    """Return the gates of these waveforms."""
     return cut_gates(waveforms(peak, **shape), GateTrain(60.0, 5.0, step, count, 1.0, 1.0, pulses))
 
 

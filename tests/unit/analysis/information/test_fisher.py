@@ -28,7 +28,6 @@ BY_NAME = {"height": DECAY / HEIGHT, "rate": -T * DECAY}
 
 
 def decay(photons=1.0, **options):
-    """Return a result with the decay, its height and rate."""
     slopes = {name: photons * PHOTON * one for name, one in BY_NAME.items()}
     return result(photons * PHOTON * DECAY, slopes, **options)
 

@@ -129,7 +129,6 @@ def test_weights_of_sharp_gates_are_shares_of_bins():
 
 
 def weights_at(table, time_ns):
-    """Return weights of a response table at arrival times [ns]."""
     return np.interp(time_ns, table.start_ns + table.step_ns * np.arange(table.values.size), table.values)
 
 

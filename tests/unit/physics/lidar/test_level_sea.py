@@ -12,7 +12,6 @@ LAYERED = LevelSea((1.33, 1.34, 1.36), (2.0, 5.0))
 
 
 def rays(theta, azimuth):
-    """Return directions at angles from the vertical and azimuths [rad]."""
     return np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), -np.cos(theta)], axis=-1)
 
 

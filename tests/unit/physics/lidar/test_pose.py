@@ -8,7 +8,6 @@ from mitransient_lidar.physics.lidar.pose import Pose
 
 
 def shots(count):
-    """Return poses that look down in random directions."""
     rng = np.random.default_rng(5)
     axis = rng.normal([0, 0, -5], 1, (count, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)

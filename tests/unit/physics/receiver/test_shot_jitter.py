@@ -31,7 +31,6 @@ def jittered(**values):
 
 
 def assert_variance(samples, variance):
-    """Compare the variance of normal samples."""
     shots = len(samples)
     assert abs(samples.var(ddof=1) / variance - 1) < largest_z(shots) * np.sqrt(2 / shots), samples.var() / variance
 

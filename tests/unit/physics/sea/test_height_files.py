@@ -153,7 +153,6 @@ def with_holes(value):
 
 
 def swapped(text):
-    """Return a table with decimal commas."""
     return text.replace(".", ",")
 
 

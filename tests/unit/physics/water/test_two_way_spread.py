@@ -18,7 +18,6 @@ def gaussian(width):
 
 
 def spreads(column, phases, cos_water=1.0, paths=256, count=8):
-    """Return independent spreads."""
     seeds = significance.seed_shift + np.arange(count)
     return [TwoWaySpread.of_column(column, phases, DEPTHS, cos_water, paths, int(seed)) for seed in seeds]
 
