@@ -2,8 +2,11 @@
 
 import functools
 import inspect
+import re
 
 import pytest
+
+from mitransient_lidar.core.errors import UserError
 
 
 def each_row(names, rows, ids=None):
@@ -41,5 +44,30 @@ def each_row(names, rows, ids=None):
         own_fixtures = [value for name, value in signature.parameters.items() if name not in names]
         all_rows.__signature__ = signature.replace(parameters=own_fixtures)
         return all_rows
+
+    return decorate
+
+
+def refuses(*rows):
+    """Return a decorator: each row is refused in one line that contains its last entry, or matches that pattern.
+
+    The first parameters of the test get the other entries of a row.
+    """
+
+    def decorate(test):
+        parameters = list(inspect.signature(test).parameters.values())
+        row = inspect.Parameter("message", inspect.Parameter.KEYWORD_ONLY)
+
+        @functools.wraps(test)
+        def refused(*, message, **given):
+            with pytest.raises(UserError) as caught:
+                test(**given)
+            sentence = str(caught.value)
+            assert message in sentence or re.search(message, sentence), f"{message!r} is not in: {sentence}"
+            assert "\n" not in sentence
+
+        refused.__signature__ = inspect.Signature([*parameters, row])
+        names = [one.name for one in parameters[: len(rows[0]) - 1]]
+        return each_row([*names, "message"], rows)(refused)
 
     return decorate

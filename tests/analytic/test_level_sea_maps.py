@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import significance
+from rows import refuses
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
@@ -59,19 +60,15 @@ def test_first_look_has_eight_passes_and_is_rendered_again():
     np.testing.assert_array_equal(mitransient_lidar.render(found)["waveform"], found["waveform"])
 
 
-@pytest.mark.parametrize(
-    ("scene", "params", "message"),
-    [
-        ("table1", {"altitude": -3}, "the lidar is under water"),
-        ("table1", {"off_nadir_deg": 60}, "more than 45 degrees from nadir"),
-        ("table1", {"scattering": 2.5, "attenuation": 3}, "light scatters 21 times on its way"),
-        ("ship_wake", {}, "its water has bubbles"),
-        ("fresh_water_lens", {}, "several refractive indices"),
-    ],
+@refuses(
+    ("table1", {"altitude": -3}, "the lidar is under water"),
+    ("table1", {"off_nadir_deg": 60}, "more than 45 degrees from nadir"),
+    ("table1", {"scattering": 2.5, "attenuation": 3}, "light scatters 21 times on its way"),
+    ("ship_wake", {}, "its water has bubbles"),
+    ("fresh_water_lens", {}, "several refractive indices"),
 )
-def test_scenes_that_the_model_is_not_for(scene, params, message):
-    with pytest.raises(UserError, match=message):
-        look(scene, params)
+def test_scenes_that_the_model_is_not_for(scene, params):
+    look(scene, params)
 
 
 def test_series_and_derivatives_need_other_light():

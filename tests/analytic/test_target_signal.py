@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.studies.detection import detect
@@ -86,19 +87,15 @@ def test_table_lists_pixels_and_combinations(published):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("scene", "params", "options", "message"),
-    [
-        ("fig13_2x2", {}, {"target_id": "mine"}, "target_id = 'mine' must be the id of a shape of the scene: .*bottom"),
-        ("fig13_2x2", {}, {"target_id": "surface"}, "target_id = 'surface' must not be the sea surface"),
-        ("fig13_2x2", {"target_depth": 13}, {}, "target 'target' lies below the bottom, up to z = -13 m"),
-        ("fig13_2x2", {"target_reflectance": 0}, {}, "it returns no light"),
-        ("fig13_2x2", {"layout": "8x8"}, {}, "is an imager"),
-    ],
+@refuses(
+    ("fig13_2x2", {}, {"target_id": "mine"}, "target_id = 'mine' must be the id of a shape of the scene: .*bottom"),
+    ("fig13_2x2", {}, {"target_id": "surface"}, "target_id = 'surface' must not be the sea surface"),
+    ("fig13_2x2", {"target_depth": 13}, {}, "target 'target' lies below the bottom, up to z = -13 m"),
+    ("fig13_2x2", {"target_reflectance": 0}, {}, "it returns no light"),
+    ("fig13_2x2", {"layout": "8x8"}, {}, "is an imager"),
 )
-def test_invalid_input_is_refused(scene, params, options, message):
-    with pytest.raises(UserError, match=message):
-        target_signal(scene, {**NEAR, **params}, passes=16, integrator=FEW, **options)
+def test_invalid_input_is_refused(scene, params, options):
+    target_signal(scene, {**NEAR, **params}, passes=16, integrator=FEW, **options)
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import refuses
 
 from mitransient_lidar.campaigns.design import Campaign, Range
 from mitransient_lidar.campaigns.sweep import render_row
@@ -72,20 +72,16 @@ def test_table_of_a_file(tmp_path):
     assert table["altitude"].tolist() == [100, 150]
 
 
-@each_row(
-    ("text", "message"),
-    [
-        ("bottom_depth\n", "a row for each run"),
-        ("bottom_depth,layout\n5\n", "run 1: it must have 2 values"),
-        ("bottom_depth,bottom_depth\n5,6\n", "name each column once"),
-        ("altitude\n5\n", "is a column of"),
-    ],
+@refuses(
+    ("bottom_depth\n", "a row for each run"),
+    ("bottom_depth,layout\n5\n", "run 1: it must have 2 values"),
+    ("bottom_depth,bottom_depth\n5,6\n", "name each column once"),
+    ("altitude\n5\n", "is a column of"),
 )
-def test_invalid_tables(tmp_path, text, message):
+def test_invalid_tables(text, tmp_path):
     (tmp_path / "runs.csv").write_text(text)
     given = {"scene": "table1", "fixed": {"altitude": 100}, "design": {"kind": "table", "file": "runs.csv"}}
-    with pytest.raises(UserError, match=message):
-        Campaign.of_file(given, tmp_path).table()
+    Campaign.of_file(given, tmp_path).table()
 
 
 def test_read(tmp_path):
@@ -111,47 +107,39 @@ def test_scene_beside_the_file(tmp_path):
 NESTED = [f'scene = "table1"\n[fixed]\nlayout = {depth * "["}{depth * "]"}\n' for depth in (120, 300, 480)]
 
 
-@each_row(
-    ("text", "message"),
-    [
-        ("scene = ", r"campaign\.toml is not a TOML file: "),
-        ("\x00", r"campaign\.toml is not a TOML file: "),
-        *((text, "is nested more than 100 deep") for text in NESTED),
-    ],
+@refuses(
+    ("scene = ", r"campaign\.toml is not a TOML file: "),
+    ("\x00", r"campaign\.toml is not a TOML file: "),
+    *((text, "is nested more than 100 deep") for text in NESTED),
 )
-def test_files_that_are_no_campaign(tmp_path, text, message):
+def test_files_that_are_no_campaign(text, tmp_path):
     (tmp_path / "campaign.toml").write_text(text)
-    with pytest.raises(UserError, match=message):
-        Campaign.read(tmp_path / "campaign.toml")
+    Campaign.read(tmp_path / "campaign.toml")
 
 
-@each_row(
-    ("sections", "message"),
-    [
-        ({"keep": ["waveform", "light"]}, "keep holds 'light'"),
-        ({"keep": []}, r"keep = \[\] must be a list"),
-        ({"gain": "auto"}, "gain = 'auto' needs a receiver"),
-        ({"fixed": {"bottom_depth": 3}}, r"'bottom_depth' is in \[fixed\] and in \[parameters\]"),
-        ({"parameters": {"altitude": {"low": 3, "high": 3}}}, "altitude has the empty range 3 to 3"),
-        ({"parameters": {"altitude": {"low": 0, "high": 2, "scale": "log"}}}, r"altitude\.low = 0 must be positive"),
-        ({"parameters": {"altitude": 3}}, r"altitude = 3 must be a range .* belongs to \[fixed\]"),
-        ({"parameters": {"altitude": [1, "a"]}}, "altitude = .* must be a range"),
-        ({"parameters": {"altitude": [1, float("nan")]}}, "altitude = nan"),
-        ({"design": {"kind": "sobol"}}, "design.count = None: a design of kind 'sobol' needs a number of runs"),
-        ({"design": {"kind": "grid", "count": 3}}, "design.count = 3"),
-        ({"design": {"kind": "sobol", "count": 2, "file": "a.csv"}}, "design.file = 'a.csv'"),
-        ({"design": {"kind": "table"}}, "design.file = None"),
-        ({"parameters": {}}, "no parameters to vary"),
-        ({"parameters": {"a": "b", "b": "a", "c": [1, 2]}}, "a, b depend on each other in a circle"),
-        ({"parameters": {"a": "z + 1", "c": [1, 2]}}, "needs z, which is neither"),
-        ({"parameters": {"a": "1 / c", "c": [0, 0.0]}}, "not finite"),
-        ({"parameters": {"a": "2 * c", "c": ["x", "y"]}}, "needs c, whose values are texts"),
-        ({"parameters": {"a": {"low": 0, "high": 1}}, "design": {"kind": "grid"}}, r"a\.steps is missing: the range"),
-    ],
+@refuses(
+    ({"keep": ["waveform", "light"]}, "keep holds 'light'"),
+    ({"keep": []}, r"keep = \[\] must be a list"),
+    ({"gain": "auto"}, "gain = 'auto' needs a receiver"),
+    ({"fixed": {"bottom_depth": 3}}, r"'bottom_depth' is in \[fixed\] and in \[parameters\]"),
+    ({"parameters": {"altitude": {"low": 3, "high": 3}}}, "altitude has the empty range 3 to 3"),
+    ({"parameters": {"altitude": {"low": 0, "high": 2, "scale": "log"}}}, r"altitude\.low = 0 must be positive"),
+    ({"parameters": {"altitude": 3}}, r"altitude = 3 must be a range .* belongs to \[fixed\]"),
+    ({"parameters": {"altitude": [1, "a"]}}, "altitude = .* must be a range"),
+    ({"parameters": {"altitude": [1, float("nan")]}}, "altitude = nan"),
+    ({"design": {"kind": "sobol"}}, "design.count = None: a design of kind 'sobol' needs a number of runs"),
+    ({"design": {"kind": "grid", "count": 3}}, "design.count = 3"),
+    ({"design": {"kind": "sobol", "count": 2, "file": "a.csv"}}, "design.file = 'a.csv'"),
+    ({"design": {"kind": "table"}}, "design.file = None"),
+    ({"parameters": {}}, "no parameters to vary"),
+    ({"parameters": {"a": "b", "b": "a", "c": [1, 2]}}, "a, b depend on each other in a circle"),
+    ({"parameters": {"a": "z + 1", "c": [1, 2]}}, "needs z, which is neither"),
+    ({"parameters": {"a": "1 / c", "c": [0, 0.0]}}, "not finite"),
+    ({"parameters": {"a": "2 * c", "c": ["x", "y"]}}, "needs c, whose values are texts"),
+    ({"parameters": {"a": {"low": 0, "high": 1}}, "design": {"kind": "grid"}}, r"a\.steps is missing: the range"),
 )
-def test_invalid_campaigns(sections, message):
-    with pytest.raises(UserError, match=message):
-        Campaign.of_file(changed(**sections)).table()
+def test_invalid_campaigns(sections):
+    Campaign.of_file(changed(**sections)).table()
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from command_line import assert_refused, run
-from rows import each_row
+from rows import each_row, refuses
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
@@ -222,40 +222,35 @@ for _ in range(100):
 SINGULAR = mi.ScalarTransform4f().scale(0)
 
 
-@each_row(
-    ("call", "sentence"),
-    [
-        (quietly(scene=3), "scene = 3 must be a shipped name, a path, a dict or a loaded scene"),
-        (quietly(passes="8"), "passes = '8' must be an integer between 2 and 1000000000"),
-        (quietly(passes=np.array([3, 4])), "passes = array([3, 4]) must be an integer"),
-        (quietly(variant=3), "variant = 3 is not supported"),
-        (quietly(integrator=3), "integrator = 3 must be the name or the dict of an integrator"),
-        (quietly(integrator={"type": "lidar_merging", "paths_per_pass": None}), "paths_per_pass = None must be"),
-        (quietly(params=["altitude"]), "params = ['altitude'] must be a dict of names and values"),
-        (quietly(params={"altitude": None}), "altitude = None must be a number, a text or a list"),
-        (quietly(params={3: 4}), "parameter 3 is not one of scene table1"),
-        (quietly(scene={}), "sensor: the scene has none"),
-        (quietly(scene={"type": "scene", "x": 3}, params={"a": 1}), "params = ['a'] need an XML scene"),
-        (as_dict(x=None), "x = None must be"),
-        (as_dict(x={"type": "sphere", "radius": None}), "x.radius = None must be"),
-        (as_dict(x={"type": "sphere", "radius": NAN}), "x.radius = nan must be finite"),
-        (as_dict(x={"type": "sphere", "to_world": SINGULAR}), "x.to_world has a scale of 0"),
-        (as_dict(x={"type": "multipixel_receiver", "aperture_area": 1e30}), "x.aperture_area = 1e+30 must lie between"),
-        (
-            as_dict(x={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 2, 0]}}),
-            "x.reflectance = 2 must lie between 0 and 1",
-        ),
-        (as_dict(x={"type": "diffuse", "reflectance": 1.5}), "x.reflectance = 1.5 must lie between 0 and 1"),
-        (as_dict(x={"type": "seabed", "dept": 3.0}), "seabed: there is no parameter dept; did you mean depth"),
-        (as_dict(**{"3": {3: 4}}), "scene: the key 3 must be a name"),
-        (as_dict(x=NESTED), "nested more than 64 deep"),
-        (lambda: mitransient_lidar.open("/dev/zero"), "/dev/zero: it is a device"),
-    ],
+@refuses(
+    (quietly(scene=3), "scene = 3 must be a shipped name, a path, a dict or a loaded scene"),
+    (quietly(passes="8"), "passes = '8' must be an integer between 2 and 1000000000"),
+    (quietly(passes=np.array([3, 4])), "passes = array([3, 4]) must be an integer"),
+    (quietly(variant=3), "variant = 3 is not supported"),
+    (quietly(integrator=3), "integrator = 3 must be the name or the dict of an integrator"),
+    (quietly(integrator={"type": "lidar_merging", "paths_per_pass": None}), "paths_per_pass = None must be"),
+    (quietly(params=["altitude"]), "params = ['altitude'] must be a dict of names and values"),
+    (quietly(params={"altitude": None}), "altitude = None must be a number, a text or a list"),
+    (quietly(params={3: 4}), "parameter 3 is not one of scene table1"),
+    (quietly(scene={}), "sensor: the scene has none"),
+    (quietly(scene={"type": "scene", "x": 3}, params={"a": 1}), "params = ['a'] need an XML scene"),
+    (as_dict(x=None), "x = None must be"),
+    (as_dict(x={"type": "sphere", "radius": None}), "x.radius = None must be"),
+    (as_dict(x={"type": "sphere", "radius": NAN}), "x.radius = nan must be finite"),
+    (as_dict(x={"type": "sphere", "to_world": SINGULAR}), "x.to_world has a scale of 0"),
+    (as_dict(x={"type": "multipixel_receiver", "aperture_area": 1e30}), "x.aperture_area = 1e+30 must lie between"),
+    (
+        as_dict(x={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 2, 0]}}),
+        "x.reflectance = 2 must lie between 0 and 1",
+    ),
+    (as_dict(x={"type": "diffuse", "reflectance": 1.5}), "x.reflectance = 1.5 must lie between 0 and 1"),
+    (as_dict(x={"type": "seabed", "dept": 3.0}), "seabed: there is no parameter dept; did you mean depth"),
+    (as_dict(**{"3": {3: 4}}), "scene: the key 3 must be a name"),
+    (as_dict(x=NESTED), "nested more than 64 deep"),
+    (lambda: mitransient_lidar.open("/dev/zero"), "/dev/zero: it is a device"),
 )
-def test_python_calls(folder, call, sentence):
-    with pytest.raises(UserError, match=re.escape(sentence)) as caught:
-        call()
-    assert "\n" not in str(caught.value)
+def test_python_calls(call, folder):
+    call()
 
 
 def test_exhausted_memory_is_one_sentence_and_other_runtime_errors_stay_bugs():

@@ -5,7 +5,7 @@ import numpy as np
 import pyproj
 import pytest
 from array_inputs import write_bag
-from rows import each_row
+from rows import refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.maps import read_bag
@@ -25,19 +25,15 @@ def test_bag_has_its_first_row_in_the_south(tmp_path, corners):
     np.testing.assert_array_equal(grid.positions["y"], [-0.75, 0.75])
 
 
-@each_row(
-    ("changes", "message"),
-    [
-        ({"corners": "0,0 7,1"}, r"has 3 cells along x, but corners that are 7 cells apart"),
-        ({"corners": "0 1"}, "has no map coordinates"),
-        ({"system": pyproj.CRS(4326).to_wkt("WKT1_GDAL")}, "has coordinates in degrees"),
-        ({"system": pyproj.CRS(4326).to_wkt("WKT2_2019")}, "has coordinates in degrees"),
-    ],
+@refuses(
+    ({"corners": "0,0 7,1"}, r"has 3 cells along x, but corners that are 7 cells apart"),
+    ({"corners": "0 1"}, "has no map coordinates"),
+    ({"system": pyproj.CRS(4326).to_wkt("WKT1_GDAL")}, "has coordinates in degrees"),
+    ({"system": pyproj.CRS(4326).to_wkt("WKT2_2019")}, "has coordinates in degrees"),
 )
-def test_bag_with_other_metadata_is_refused(tmp_path, changes, message):
+def test_bag_with_other_metadata_is_refused(changes, tmp_path):
     write_bag(tmp_path / "a.bag", HEIGHTS, (0.0, 0.0), (1.0, 1.0), **changes)
-    with pytest.raises(UserError, match=message):
-        read_bag(tmp_path / "a.bag")
+    read_bag(tmp_path / "a.bag")
 
 
 def test_bag_states_its_datum_and_is_positive_up(tmp_path):

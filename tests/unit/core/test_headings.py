@@ -3,7 +3,7 @@
 import time
 
 import pytest
-from rows import each_row
+from rows import each_row, refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables.headings import (
@@ -62,20 +62,16 @@ def test_headings_are_understood(text, column, factor, wavelength):
         assert heading.wavelength_nm == wavelength
 
 
-@each_row(
-    ("names", "message"),
-    [
-        (["depth", "Tiefe"], r"^x.csv has an unknown column 'Tiefe' \(found: depth, Tiefe\): allowed are time \[ns, "),
-        (["depth [hPa]", "a"], r"unit in column 'depth \[hPa\]' \(found: .*depth, z \[m, cm, mm, km, dm, ft, ftus"),
-        (["a_nw", "depth"], "unknown unit in column 'a_nw'"),
-        (["a532", "a_532"], "has 2 columns a532 and a_532 for a: allowed is one"),
-        (["a412", "a532"], "has columns for 412, 532 nm: the wavelength must be chosen, .* by wavelength_nm"),
-        (["a412.5", "c532"], "has columns for 412.5, 532 nm"),
-    ],
+@refuses(
+    (["depth", "Tiefe"], r"^x.csv has an unknown column 'Tiefe' \(found: depth, Tiefe\): allowed are time \[ns, "),
+    (["depth [hPa]", "a"], r"unit in column 'depth \[hPa\]' \(found: .*depth, z \[m, cm, mm, km, dm, ft, ftus"),
+    (["a_nw", "depth"], "unknown unit in column 'a_nw'"),
+    (["a532", "a_532"], "has 2 columns a532 and a_532 for a: allowed is one"),
+    (["a412", "a532"], "has columns for 412, 532 nm: the wavelength must be chosen, .* by wavelength_nm"),
+    (["a412.5", "c532"], "has columns for 412.5, 532 nm"),
 )
-def test_unclear_headings_are_rejected(names, message):
-    with pytest.raises(UserError, match=message):
-        read_headings("x.csv", names, COLUMNS)
+def test_unclear_headings_are_rejected(names):
+    read_headings("x.csv", names, COLUMNS)
 
 
 @pytest.mark.parametrize("text", ["depth" + 2 * 10**5 * " " + "x", "depth" + 10**5 * " x"])

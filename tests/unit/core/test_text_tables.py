@@ -4,7 +4,7 @@ import logging
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables import text_tables
@@ -63,27 +63,22 @@ def test_fill_values_count_as_missing_only_where_the_column_says_so(path):
     np.testing.assert_array_equal(table.columns["b"], [-9999, 3])
 
 
-@each_row(
-    ("text", "message"),
-    [
-        *((f"0 0\n{line}\n", f"line 2: '{line}' must be two numbers, time in ns and power") for line in ("1 2 3", "1")),
-        ("0 0\n1 x\n", "line 2: '1 x' must be two numbers, time in ns and power"),
-        ("0 x\n1 2\n3 4\n", "line 1: '0 x' must be two numbers"),
-        ("0 0\ntime power\n", "line 2: 'time power' must be two numbers"),
-        ("t,power\n0,0\n1,x\n", r"line 3: power = 'x' must be a number$"),
-        ("t,power\n0,0\n1,2,3\n4,5\n", r"line 3 has 3 values but must have 2, one for each column$"),
-        ("t [fs],power\n0,0\n1,2\n", r"unit in column 't \[fs\]' \(found: t \[fs\], power\): allowed are time \[ns"),
-        ("Zeit,Leistung\n0,0\n1,2\n", r"no heading with known columns \(found: Zeit, Leistung\): allowed are time"),
-        ("t,power,CH1\n0,0,1\n1,2,1\n", r"unknown column 'CH1' \(found: t, power, CH1\): allowed are time .*, power\."),
-        ("t,V,mV\n0,0,1\n1,2,1\n", "has 2 columns V and mV for power: allowed is one"),
-        ("t,power\n0,0\n4e-9,1\n", "times from 0 to 4e-09 without a unit, too short for ns: .* such as time_s"),
-    ],
+@refuses(
+    *((f"0 0\n{line}\n", f"line 2: '{line}' must be two numbers, time in ns and power") for line in ("1 2 3", "1")),
+    ("0 0\n1 x\n", "line 2: '1 x' must be two numbers, time in ns and power"),
+    ("0 x\n1 2\n3 4\n", "line 1: '0 x' must be two numbers"),
+    ("0 0\ntime power\n", "line 2: 'time power' must be two numbers"),
+    ("t,power\n0,0\n1,x\n", r"line 3: power = 'x' must be a number$"),
+    ("t,power\n0,0\n1,2,3\n4,5\n", r"line 3 has 3 values but must have 2, one for each column$"),
+    ("t [fs],power\n0,0\n1,2\n", r"unit in column 't \[fs\]' \(found: t \[fs\], power\): allowed are time \[ns"),
+    ("Zeit,Leistung\n0,0\n1,2\n", r"no heading with known columns \(found: Zeit, Leistung\): allowed are time"),
+    ("t,power,CH1\n0,0,1\n1,2,1\n", r"unknown column 'CH1' \(found: t, power, CH1\): allowed are time .*, power\."),
+    ("t,V,mV\n0,0,1\n1,2,1\n", "has 2 columns V and mV for power: allowed is one"),
+    ("t,power\n0,0\n4e-9,1\n", "times from 0 to 4e-09 without a unit, too short for ns: .* such as time_s"),
 )
-def test_unclear_tables_are_rejected(path, text, message):
+def test_unclear_tables_are_rejected(text, path):
     path.write_text(text)
-    with pytest.raises(UserError, match=message) as error:
-        read_time_samples(path, POWER)
-    assert "\n" not in str(error.value)
+    read_time_samples(path, POWER)
 
 
 def test_large_files_are_rejected_at_once(path):

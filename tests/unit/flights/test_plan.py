@@ -4,9 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import refuses
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.plan import FlightPlan, flights
 from mitransient_lidar.flights.preparation import input_columns
 from mitransient_lidar.flights.renderer import FlightRenderer
@@ -25,19 +24,15 @@ def test_shipped_flights_have_poses(name):
     assert FlightPlan.from_json(plan.text).text == plan.text
 
 
-@each_row(
-    ("change", "message"),
-    [
-        ({"sence": "flight"}, "'sence' is no key of a flight"),
-        ({"receiver": {"gain": "best"}}, "receiver.gain = 'best' must be a number or auto"),
-        ({"receiver": {"gain": "auto", "optical_density": "auto"}}, "are alternatives: give one of them"),
-        ({"estimator": "best"}, "estimator = 'best' must be one of"),
-        ({"parameters": {"altitude": 200}}, "'altitude' follows from the poses"),
-    ],
+@refuses(
+    ({"sence": "flight"}, "'sence' is no key of a flight"),
+    ({"receiver": {"gain": "best"}}, "receiver.gain = 'best' must be a number or auto"),
+    ({"receiver": {"gain": "auto", "optical_density": "auto"}}, "are alternatives: give one of them"),
+    ({"estimator": "best"}, "estimator = 'best' must be one of"),
+    ({"parameters": {"altitude": 200}}, "'altitude' follows from the poses"),
 )
-def test_bad_flights_are_one_sentence(change, message):
-    with pytest.raises(UserError, match=message):
-        FlightPlan.of_file({**FLIGHT, **change})
+def test_bad_flights_are_one_sentence(change):
+    FlightPlan.of_file({**FLIGHT, **change})
 
 
 def test_pulses_of_one_group_have_similar_poses():

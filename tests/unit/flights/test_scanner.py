@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, refuses
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
 from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.poses.trajectory import Trajectory
@@ -103,15 +102,11 @@ def test_every_line_of_a_flight_begins_with_a_whole_point():
         assert len(np.unique(poses.axis[poses.line == line][:1000].round(9), axis=0)) == 1000
 
 
-@each_row(
-    ("given", "message"),
-    [
-        ({}, "has no kind"),
-        ({"kind": ["palmer"]}, r"kind = \['palmer'\] of a scanner must be one of"),
-        ({"kind": "spiral"}, "kind = 'spiral' of a scanner must be one of palmer, semi_arc"),
-        ({**RASTER, "lines": 10**5, "points": 10**5}, "must be at most 1000000000"),
-    ],
+@refuses(
+    ({}, "has no kind"),
+    ({"kind": ["palmer"]}, r"kind = \['palmer'\] of a scanner must be one of"),
+    ({"kind": "spiral"}, "kind = 'spiral' of a scanner must be one of palmer, semi_arc"),
+    ({**RASTER, "lines": 10**5, "points": 10**5}, "must be at most 1000000000"),
 )
-def test_invalid_scanners(given, message):
-    with pytest.raises(UserError, match=message):
-        Scanner.of_table(given)
+def test_invalid_scanners(given):
+    Scanner.of_table(given)

@@ -1,6 +1,7 @@
 """Shipped scenes."""
 
 import pytest
+from rows import refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
@@ -43,17 +44,13 @@ def test_path_of_name_and_of_file(folder, tmp_path):
     assert catalogue.scene_path(own) == own
 
 
-@pytest.mark.parametrize(
-    ("name", "sentence"),
-    [
-        ("fig9", "scene 'fig9' is neither a file nor a shipped scene; did you mean fig09"),
-        ("scenes/fig10.XML", "did you mean fig10"),
-        ("zzz", "scene 'zzz' .*; shipped scenes are fig09, fig10"),
-    ],
+@refuses(
+    ("fig9", "scene 'fig9' is neither a file nor a shipped scene; did you mean fig09"),
+    ("scenes/fig10.XML", "did you mean fig10"),
+    ("zzz", "scene 'zzz' .*; shipped scenes are fig09, fig10"),
 )
-def test_unknown_scene(folder, name, sentence):
-    with pytest.raises(UserError, match=sentence):
-        catalogue.scene_path(name)
+def test_unknown_scene(name, folder):
+    catalogue.scene_path(name)
 
 
 def test_first_default_wins_as_in_mitsuba(folder):

@@ -7,7 +7,7 @@ import os
 import mitsuba as mi
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
@@ -42,23 +42,19 @@ def test_folders_of_a_scene_are_not_kept_for_others(tmp_path):
     assert [str(path) for path in mi.file_resolver()] == before
 
 
-@each_row(
-    ("attributes", "message"),
-    [
-        ({"scene_xml": 3}, "the attribute scene_xml = 3 of the result is damaged: it must be a text"),
-        ({"scene_xml": "<scene/>", "scene.depth": [1, 2]}, r"scene.depth = \[1, 2\] of the result is damaged"),
-        ({"scene_xml": "<scene/>", "scene_files": "[3]"}, "scene_files of the result is damaged"),
-        ({"scene_xml": "<scene/>", "scene_files": "{"}, "scene_files of the result is damaged"),
-        ({"scene_xml": "<scene>"}, "is not well-formed XML"),
-        ({"scene_dict": "[" * 10**5}, "the scene of the result is nested more than 100 deep"),
-        ({"scene_dict": "[1]"}, "its text must be JSON of a scene"),
-        ({"scene_dict": '{"to_world": {"matrix": 3, "inverse_transpose": []}}'}, "its text must be JSON of a scene"),
-        ({}, "does not hold its scene"),
-    ],
+@refuses(
+    ({"scene_xml": 3}, "the attribute scene_xml = 3 of the result is damaged: it must be a text"),
+    ({"scene_xml": "<scene/>", "scene.depth": [1, 2]}, r"scene.depth = \[1, 2\] of the result is damaged"),
+    ({"scene_xml": "<scene/>", "scene_files": "[3]"}, "scene_files of the result is damaged"),
+    ({"scene_xml": "<scene/>", "scene_files": "{"}, "scene_files of the result is damaged"),
+    ({"scene_xml": "<scene>"}, "is not well-formed XML"),
+    ({"scene_dict": "[" * 10**5}, "the scene of the result is nested more than 100 deep"),
+    ({"scene_dict": "[1]"}, "its text must be JSON of a scene"),
+    ({"scene_dict": '{"to_world": {"matrix": 3, "inverse_transpose": []}}'}, "its text must be JSON of a scene"),
+    ({}, "does not hold its scene"),
 )
-def test_damaged_records_are_refused(attributes, message):
-    with pytest.raises(UserError, match=message):
-        open_scene(SceneSource.from_attributes(attributes))
+def test_damaged_records_are_refused(attributes):
+    open_scene(SceneSource.from_attributes(attributes))
 
 
 def stranger(folder, name, text):

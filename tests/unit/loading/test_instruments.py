@@ -5,7 +5,7 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, refuses
 
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.core.errors import UserError
@@ -159,17 +159,13 @@ def test_unknown_instruments_are_refused(name, sentence):
         scenes.open_scene("table1", None, name)
 
 
-@each_row(
-    ("scene", "params", "sentence"),
-    [
-        ("table1", {"layout": "1x1"}, "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil"),
-        ({"type": "scene"}, None, "instrument = 'teledyne_czmil' needs an XML scene, not a dict"),
-        ("loaded", None, "not a loaded scene"),
-    ],
+@refuses(
+    ("table1", {"layout": "1x1"}, "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil"),
+    ({"type": "scene"}, None, "instrument = 'teledyne_czmil' needs an XML scene, not a dict"),
+    ("loaded", None, "not a loaded scene"),
 )
-def test_what_an_instrument_does_not_fit_is_refused(scene, params, sentence):
-    with pytest.raises(UserError, match=sentence):
-        scenes.open_scene(mi.load_dict({"type": "scene"}) if scene == "loaded" else scene, params, "teledyne_czmil")
+def test_what_an_instrument_does_not_fit_is_refused(scene, params):
+    scenes.open_scene(mi.load_dict({"type": "scene"}) if scene == "loaded" else scene, params, "teledyne_czmil")
 
 
 def test_parameters_of_an_infrared_channel():

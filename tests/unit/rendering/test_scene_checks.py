@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.echo_times import bottom_time_ns
+from rows import refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.level_sea import snell
@@ -104,19 +105,15 @@ def test_axes_that_do_not_meet_are_told(lidar_scene, caplog):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        ({"rx": UP}, "no pixel sees the sea or a solid: the receiver looks above the horizon"),
-        ({"rx": UP, "tx": UP}, "laser and receiver look above the horizon"),
-        ({"rx": {"aim_x": 900.0}, "sea": {"centre_x": 0.0, "size": 1000.0}}, r"receiver looks at the sea level from"),
-        ({"rx": {"aim_x": 60.0}}, r"beam and field of view do not overlap: they are 5\d\.\d m apart on the sea level"),
-        ({"film": {"time_start_ns": 1620.0}}, "starts the record after every echo: it must be less than 149"),
-    ],
+@refuses(
+    ({"rx": UP}, "no pixel sees the sea or a solid: the receiver looks above the horizon"),
+    ({"rx": UP, "tx": UP}, "laser and receiver look above the horizon"),
+    ({"rx": {"aim_x": 900.0}, "sea": {"centre_x": 0.0, "size": 1000.0}}, r"receiver looks at the sea level from"),
+    ({"rx": {"aim_x": 60.0}}, r"beam and field of view do not overlap: they are 5\d\.\d m apart on the sea level"),
+    ({"film": {"time_start_ns": 1620.0}}, "starts the record after every echo: it must be less than 149"),
 )
-def test_scenes_that_return_no_light_are_refused(lidar_scene, caplog, parts, message):
-    with pytest.raises(UserError, match=message):
-        check(lidar_scene(**parts), caplog)
+def test_scenes_that_return_no_light_are_refused(parts, lidar_scene, caplog):
+    check(lidar_scene(**parts), caplog)
 
 
 @pytest.mark.parametrize(("flips", "inwards"), [(False, False), (False, True)])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
-from rows import each_row
+from rows import each_row, refuses
 from waveform_writers import Packets, Return, Sampling, Segment, Shot, write_las, write_pulse_waves
 
 import mitransient_lidar
@@ -265,20 +265,16 @@ def test_wrong_pulse_waves_files_are_refused(tmp_path, case):
         read_waveforms(tmp_path / "bad.pls")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"waveforms": (3, 3)}, "waveforms = 3:3 must end after 3, the first one"),
-        ({"waveforms": (-1, 3)}, "waveforms = -1 must lie between 0"),
-        ({"channel": "one"}, "channel = one must be a number, or the name of a field"),
-        ({"lidar": {"altitud": 3}}, "lidar states altitud, which is none of altitude, sea_level"),
-        ({"lidar": {"pulse_fwhm_ns": -3}}, "lidar has the attribute pulse_fwhm_ns = -3"),
-    ],
+@refuses(
+    ({"waveforms": (3, 3)}, "waveforms = 3:3 must end after 3, the first one"),
+    ({"waveforms": (-1, 3)}, "waveforms = -1 must lie between 0"),
+    ({"channel": "one"}, "channel = one must be a number, or the name of a field"),
+    ({"lidar": {"altitud": 3}}, "lidar states altitud, which is none of altitude, sea_level"),
+    ({"lidar": {"pulse_fwhm_ns": -3}}, "lidar has the attribute pulse_fwhm_ns = -3"),
 )
-def test_wrong_selections_are_refused(tmp_path, options, message):
+def test_wrong_selections_are_refused(options, tmp_path):
     las_with(tmp_path / "one.las")
-    with pytest.raises(UserError, match=message):
-        open_file(tmp_path / "one.las", **options)
+    open_file(tmp_path / "one.las", **options)
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path):

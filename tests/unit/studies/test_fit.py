@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from closed_form_waveform import TRUTH, closed_form, noisy
-from rows import each_row
+from rows import refuses
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
@@ -108,23 +108,19 @@ def test_light_is_known_between_bins(width, given, monkeypatch, caplog):
     assert ("set bin_width_ns to 0.12 or less" in caplog.text) == (given is not None)
 
 
-@each_row(
-    ("free", "options", "message"),
-    [
-        (["bottom_deep"], {}, "parameter 'bottom_deep' is not one of the scene: did you mean bottom_depth"),
-        ([], {}, "must name one or more parameters"),
-        (["attenuation", "attenuation"], {}, "names attenuation twice"),
-        (["attenuation"], {"params": {"attenuation": "0.9, 0.5"}}, r"name one of its elements attenuation\[0\]"),
-        (["attenuation[2]"], {}, r"parameter attenuation\[2\]: the index must be 0 to 0"),
-        (["bin_count"], {}, "parameter bin_count = 'auto' is not a number"),
-        (["attenuation"], {"free_scale": True, "start": {"scale": -1}}, "start of scale = -1 must lie between 0 and"),
-        (["attenuation"], {"start": {"attenuatoin": 1}}, "start of attenuatoin: it is not one of the free"),
-    ],
+@refuses(
+    (["bottom_deep"], {}, "parameter 'bottom_deep' is not one of the scene: did you mean bottom_depth"),
+    ([], {}, "must name one or more parameters"),
+    (["attenuation", "attenuation"], {}, "names attenuation twice"),
+    (["attenuation"], {"params": {"attenuation": "0.9, 0.5"}}, r"name one of its elements attenuation\[0\]"),
+    (["attenuation[2]"], {}, r"parameter attenuation\[2\]: the index must be 0 to 0"),
+    (["bin_count"], {}, "parameter bin_count = 'auto' is not a number"),
+    (["attenuation"], {"free_scale": True, "start": {"scale": -1}}, "start of scale = -1 must lie between 0 and"),
+    (["attenuation"], {"start": {"attenuatoin": 1}}, "start of attenuatoin: it is not one of the free"),
 )
-def test_invalid_parameters_are_refused(free, options, message, renders):
+def test_invalid_parameters_are_refused(free, options, renders):
     data = noisy(0.01, np.random.default_rng(4), pixels=("red",))
-    with pytest.raises(UserError, match=message):
-        mitransient_lidar.fit(data, "table1", free, **options)
+    mitransient_lidar.fit(data, "table1", free, **options)
 
 
 def test_the_time_ends_a_fit_before_it_converges(monkeypatch, caplog):

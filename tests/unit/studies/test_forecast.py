@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import rasterio
 import xarray as xr
+from rows import refuses
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.studies import forecast as study
 from mitransient_lidar.studies.forecast import describe_forecast, forecast, write_maps
 
@@ -107,24 +107,20 @@ def test_sentences_of_the_extremes(site, options, sentence, tables):
     assert sentence in describe_forecast(forecast("riegl_vq840g", site, secchi=8, **options))[-1]
 
 
-@pytest.mark.parametrize(
-    ("site", "options", "message"),
-    [
-        ("no:3", {}, "site = 'no:3' must be a map, or a range of depths such as 1:20"),
-        ("0.1:0.3", {}, "must be deeper than 0.5 m somewhere, but is 0.3 m deep"),
-        ("1:3", {"kd": 0.1, "secchi": 5}, "secchi = 5 and kd = 0.1 are alternatives: give one of them"),
-        ("1:3", {"kd": "map.tif"}, "must be a number, unless the site is a map"),
-        ("1:3", {"params": {"bottom_depth": 2}}, "parameter bottom_depth follows from the site: leave it out"),
-        ("1:3", {"instrument": "riegl_vq880g2_infrared"}, "has wavelength_nm = 1064: forecasts are of green light"),
-        ("map", {"kd": "far"}, "must cover cells of the site that are deeper than"),
-    ],
+@refuses(
+    ("no:3", {}, "site = 'no:3' must be a map, or a range of depths such as 1:20"),
+    ("0.1:0.3", {}, "must be deeper than 0.5 m somewhere, but is 0.3 m deep"),
+    ("1:3", {"kd": 0.1, "secchi": 5}, "secchi = 5 and kd = 0.1 are alternatives: give one of them"),
+    ("1:3", {"kd": "map.tif"}, "must be a number, unless the site is a map"),
+    ("1:3", {"params": {"bottom_depth": 2}}, "parameter bottom_depth follows from the site: leave it out"),
+    ("1:3", {"instrument": "riegl_vq880g2_infrared"}, "has wavelength_nm = 1064: forecasts are of green light"),
+    ("map", {"kd": "far"}, "must cover cells of the site that are deeper than"),
 )
-def test_refusals(site, options, message, tables, tmp_path):
+def test_refusals(site, options, tables, tmp_path):
     if site == "map":
         site = geotiff(tmp_path / "site.tif", [[-4.0, -6.0], [-8.0, -12.0]])
         options = {"kd": geotiff(tmp_path / "far.tif", [[0.1, 0.1], [0.1, 0.1]], corner=(600000.0, 6500000.0))}
-    with pytest.raises(UserError, match=message):
-        forecast(**{"instrument": "riegl_vq840g", "site": site, **options})
+    forecast(**{"instrument": "riegl_vq840g", "site": site, **options})
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import refuses
 from scipy.stats import chi2, norm, pearson3
 from significance import FALSE_ALARM, largest_z
 
@@ -177,15 +177,11 @@ def test_delays_reach_the_bound():
     assert 0.97 * low < found.var(ddof=1) / bound**2 < 1.03 * high
 
 
-@each_row(
-    ("call", "message"),
-    [
-        (lambda: sample_moments(RECEIVERS["apd"], -LIGHT, 1.0, GATE), "must not be negative"),
-        (lambda: delays(np.ones((2, 40)), echoes(STEPS), STEPS, np.ones((40, 40))), "must be positive definite"),
-        (lambda: matched_weights(np.zeros(2), np.eye(2)), "signal must not be 0"),
-        (lambda: matched_weights(np.array([1.0, 0.0]), np.ones((2, 2))), "covariance must be positive definite"),
-    ],
+@refuses(
+    (lambda: sample_moments(RECEIVERS["apd"], -LIGHT, 1.0, GATE), "must not be negative"),
+    (lambda: delays(np.ones((2, 40)), echoes(STEPS), STEPS, np.ones((40, 40))), "must be positive definite"),
+    (lambda: matched_weights(np.zeros(2), np.eye(2)), "signal must not be 0"),
+    (lambda: matched_weights(np.array([1.0, 0.0]), np.ones((2, 2))), "covariance must be positive definite"),
 )
-def test_invalid_input(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+def test_invalid_input(call):
+    call()

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from oracles.gates import transmission
-from rows import each_row
+from rows import refuses
 from scipy.integrate import quad
 from scipy.stats import norm
 from small_results import made
@@ -141,20 +141,16 @@ def test_nan_stays_in_its_gates():
     assert np.isfinite(stack["gate_energy"][0]).all()
 
 
-@each_row(
-    ("train", "message"),
-    [
-        (GateTrain(1402.0, 5.0, 5.0, 3), r"before the surface: .* closes at 1417\.0 ns.* arrives at 1420\.0 ns"),
-        (GateTrain(1530.0, 5.0, 5.0, 3), r"gate 0 is open from 1530\.0 to 1535\.0 ns.* the record, 1400\.0 to 1520"),
-        (GateTrain(1500.0, 5.0, 5.0, 5), r"gate 4 is open from 1520\.0 to 1525\.0"),
-        (GateTrain(1399.9, 5.0, 5.0, 9), r"gate 0 is open from 1399\.9"),
-        # Half heights within the record, the edge outside
-        (GateTrain(1500.0, 5.0, 5.0, 4, 0.0, 2.0), r"gate 3 is open from 1515\.0 to 1521\.7"),
-    ],
+@refuses(
+    (GateTrain(1402.0, 5.0, 5.0, 3), r"before the surface: .* closes at 1417\.0 ns.* arrives at 1420\.0 ns"),
+    (GateTrain(1530.0, 5.0, 5.0, 3), r"gate 0 is open from 1530\.0 to 1535\.0 ns.* the record, 1400\.0 to 1520"),
+    (GateTrain(1500.0, 5.0, 5.0, 5), r"gate 4 is open from 1520\.0 to 1525\.0"),
+    (GateTrain(1399.9, 5.0, 5.0, 9), r"gate 0 is open from 1399\.9"),
+    # Half heights within the record, the edge outside
+    (GateTrain(1500.0, 5.0, 5.0, 4, 0.0, 2.0), r"gate 3 is open from 1515\.0 to 1521\.7"),
 )
-def test_trains_outside_the_record_are_rejected(train, message):
-    with pytest.raises(UserError, match=message):
-        gating.cut_gates(record(), train)
+def test_trains_outside_the_record_are_rejected(train):
+    gating.cut_gates(record(), train)
 
 
 def test_train_before_a_record_of_unknown_surface():
@@ -213,17 +209,13 @@ def test_gates_narrower_than_bins_are_cut_with_a_warning_of_the_error(caplog):
     assert f"than the bins of 5 ns: the energy of an echo may be wrong by up to {100 * bound:.0f} %" in caplog.text
 
 
-@each_row(
-    ("options", "message"),
-    [
-        ({"width_ns": 5.0}, "one start: start_ns, start_depth_m or start_range_m"),
-        ({"start_ns": 1.0, "start_depth_m": 1.0, "width_ns": 5.0}, "one start"),
-        ({"start_ns": 1.0}, "one shape: either width_ns or a profile file"),
-        ({"start_ns": 1.0, "width_ns": 5.0, "profile_file": "gate.txt"}, "one shape"),
-        ({"start_ns": 1.0, "profile_file": "gate.txt", "rise_ns": 2.0}, "must be 0 with a profile"),
-        ({"start_ns": 1.0, "profile_file": "missing.txt"}, r"cannot read missing\.txt: No such file"),
-    ],
+@refuses(
+    ({"width_ns": 5.0}, "one start: start_ns, start_depth_m or start_range_m"),
+    ({"start_ns": 1.0, "start_depth_m": 1.0, "width_ns": 5.0}, "one start"),
+    ({"start_ns": 1.0}, "one shape: either width_ns or a profile file"),
+    ({"start_ns": 1.0, "width_ns": 5.0, "profile_file": "gate.txt"}, "one shape"),
+    ({"start_ns": 1.0, "profile_file": "gate.txt", "rise_ns": 2.0}, "must be 0 with a profile"),
+    ({"start_ns": 1.0, "profile_file": "missing.txt"}, r"cannot read missing\.txt: No such file"),
 )
-def test_options_that_do_not_go_together(options, message):
-    with pytest.raises(UserError, match=message):
-        gate_stack.train_from_options(GEOMETRY, **options)
+def test_options_that_do_not_go_together(options):
+    gate_stack.train_from_options(GEOMETRY, **options)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from figure_inputs import LIDAR, stack
-from rows import each_row
+from rows import refuses
 from scipy.special import ndtr
 from scipy.stats import binom, chi2
 
@@ -80,19 +80,15 @@ def test_range_without_light_or_with_holes():
     np.testing.assert_array_equal(found.confidence, [0, 1, 0])
 
 
-@each_row(
-    ("arguments", "options", "message"),
-    [
-        ((np.ones((2, 4)), np.ones((2, 5)), np.arange(4)), {}, "must be equal, with the 4 gates"),
-        ((np.ones(2), np.ones(2), np.arange(2)), {}, "2 gates and must have at least 3"),
-        ((np.ones(3), np.ones(3), [0, 2, 1]), {}, "gate_mid must increase strictly"),
-        ((np.ones(3), -np.ones(3), [0, 1, 2]), {}, "stderr = -1 must not be negative"),
-        ((np.ones(9), np.ones(9), np.arange(9)), {"reach": 4}, "reach = 4 must lie between 0 and 3"),
-    ],
+@refuses(
+    ((np.ones((2, 4)), np.ones((2, 5)), np.arange(4)), {}, "must be equal, with the 4 gates"),
+    ((np.ones(2), np.ones(2), np.arange(2)), {}, "2 gates and must have at least 3"),
+    ((np.ones(3), np.ones(3), [0, 2, 1]), {}, "gate_mid must increase strictly"),
+    ((np.ones(3), -np.ones(3), [0, 1, 2]), {}, "stderr = -1 must not be negative"),
+    ((np.ones(9), np.ones(9), np.arange(9)), {"reach": 4}, "reach = 4 must lie between 0 and 3"),
 )
-def test_range_refuses_bad_input(arguments, options, message):
-    with pytest.raises(ValueError, match=message):
-        range_from_gates(*arguments, **options)
+def test_range_refuses_bad_input(arguments, options):
+    range_from_gates(*arguments, **options)
 
 
 def test_the_strongest_of_two_echoes_counts_though_its_error_is_larger():

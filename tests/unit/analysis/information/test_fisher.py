@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from differentiated import PHOTON, result
-from rows import each_row
+from rows import refuses
 from significance import largest_chi2, largest_z
 
 from mitransient_lidar.analysis.information.fisher import fisher_information
 from mitransient_lidar.analysis.receiver import detect_waveforms
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser
@@ -229,18 +228,14 @@ def test_parameters_without_influence_and_degenerate_pairs():
     assert "height and nearly have a correlation of -0.99" in found.attrs["remarks"]
 
 
-@each_row(
-    ("change", "options", "message"),
-    [
-        (lambda data: data.drop_vars("waveform_derivative"), {}, "has no waveform_derivative"),
-        (lambda data: data.assign(waveform_derivative=np.nan * data["waveform_derivative"]), {}, "not finite"),
-        (lambda data: [data, data.assign_coords(time=data["time"] + 1)], {}, "the renders differ in time"),
-        (lambda data: [], {}, "must hold at least one result"),
-        (lambda data: data, {"nuisances": {"phase": 1.0}}, "nuisance = 'phase' must be one of time_offset, scale"),
-        (lambda data: data, {"nuisances": {"scale": 0.0}}, "scale = 0.0 must be a standard deviation above 0"),
-        (lambda data: data.assign(waveform_derivative=0 * data["waveform_derivative"]), {}, "no information"),
-    ],
+@refuses(
+    (lambda data: data.drop_vars("waveform_derivative"), {}, "has no waveform_derivative"),
+    (lambda data: data.assign(waveform_derivative=np.nan * data["waveform_derivative"]), {}, "not finite"),
+    (lambda data: [data, data.assign_coords(time=data["time"] + 1)], {}, "the renders differ in time"),
+    (lambda data: [], {}, "must hold at least one result"),
+    (lambda data: data, {"nuisances": {"phase": 1.0}}, "nuisance = 'phase' must be one of time_offset, scale"),
+    (lambda data: data, {"nuisances": {"scale": 0.0}}, "scale = 0.0 must be a standard deviation above 0"),
+    (lambda data: data.assign(waveform_derivative=0 * data["waveform_derivative"]), {}, "no information"),
 )
-def test_invalid_input(change, options, message):
-    with pytest.raises(UserError, match=message):
-        fisher_information(change(decay()), **{"chain": "ideal", **options})
+def test_invalid_input(change, options):
+    fisher_information(change(decay()), **{"chain": "ideal", **options})

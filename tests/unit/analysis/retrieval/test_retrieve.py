@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
-from rows import each_row
+from rows import refuses
 from scipy.stats import truncnorm
 from synthetic_shots import (
     ANGLE_X,
@@ -285,25 +285,20 @@ def drop(name):
     return shot
 
 
-@each_row(
-    ("call", "sentence"),
-    [
-        (lambda: retrieve.surface_slopes(on_axis().isel(pixel=[0])), "waveforms of at least 2 pixels"),
-        (lambda: retrieve.surface_slopes(drop("altitude")), "the dataset has no attribute altitude"),
-        (lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=0.1), r"wind_speed = 0\.1 must lie between 1 and 30"),
-        (lambda: retrieve.surface_slopes(result(), wind_speed=6), "wind_speed = 6 needs a result of a round Gaussian"),
-        (
-            lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=6, slope_deviation=(0.1, 0.1)),
-            "slope_deviation = .* and wind_speed = 6 are alternatives",
-        ),
-        (lambda: retrieve.bottom(result().drop_vars("waveform"), LEVEL), "the dataset has no waveform"),
-        (lambda: retrieve.bottom(result(obscuration=2.0), LEVEL), "obscuration = 2.0: it must be a number between 0"),
-        (lambda: retrieve.bottom(drop("two_way_efficiency"), LEVEL), "efficiency must be given"),
-        (lambda: retrieve.water(result(field_of_view_mrad=20.0)), r"spot_diameter = 4\.2\d+ must be at least 6"),
-        (lambda: retrieve.water(result().isel(pixel=0)), r"waveform has the dimensions \('time',\)"),
-    ],
+@refuses(
+    (lambda: retrieve.surface_slopes(on_axis().isel(pixel=[0])), "waveforms of at least 2 pixels"),
+    (lambda: retrieve.surface_slopes(drop("altitude")), "the dataset has no attribute altitude"),
+    (lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=0.1), r"wind_speed = 0\.1 must lie between 1 and 30"),
+    (lambda: retrieve.surface_slopes(result(), wind_speed=6), "wind_speed = 6 needs a result of a round Gaussian"),
+    (
+        lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=6, slope_deviation=(0.1, 0.1)),
+        "slope_deviation = .* and wind_speed = 6 are alternatives",
+    ),
+    (lambda: retrieve.bottom(result().drop_vars("waveform"), LEVEL), "the dataset has no waveform"),
+    (lambda: retrieve.bottom(result(obscuration=2.0), LEVEL), "obscuration = 2.0: it must be a number between 0"),
+    (lambda: retrieve.bottom(drop("two_way_efficiency"), LEVEL), "efficiency must be given"),
+    (lambda: retrieve.water(result(field_of_view_mrad=20.0)), r"spot_diameter = 4\.2\d+ must be at least 6"),
+    (lambda: retrieve.water(result().isel(pixel=0)), r"waveform has the dimensions \('time',\)"),
 )
-def test_invalid_input(call, sentence):
-    with pytest.raises(UserError, match=sentence) as refused:
-        call()
-    assert "\n" not in str(refused.value)
+def test_invalid_input(call):
+    call()

@@ -20,12 +20,11 @@ from lake_waveforms import (
     result,
     waveform,
 )
-from rows import each_row
+from rows import each_row, refuses
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.waveforms import csv_tables, echo_table
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
-from mitransient_lidar.core.errors import UserError
 
 #: Delays of targets behind the surface [ns], of four waveforms.
 PLACES = [[], [40], [40, 28], [44, 34, 54]]
@@ -218,27 +217,22 @@ def drop(name):
     return shot
 
 
-@each_row(
-    ("dataset", "options", "sentence"),
-    [
-        (result().transpose("time", "pixel"), {}, r"waveform has the dimensions \('time', 'pixel'\)"),
-        (result().drop_vars("pixel"), {}, "the dataset has no coordinate pixel"),
-        (result().drop_vars("time"), {}, "the dataset has no coordinate time"),
-        (result().drop_vars("waveform"), {}, "must have waveforms over time or signals of a receiver"),
-        (drop("altitude"), {}, "the dataset has no attribute altitude"),
-        (drop("pulse_fwhm_ns"), {}, "the dataset has no attribute pulse_fwhm_ns"),
-        (result(np.full((1, BINS), np.nan)), {}, "waveform holds values that are not finite"),
-        (result(), {"estimators": "best"}, "estimator 'best' must be one of"),
-        (result(), {"estimators": []}, "estimator '' must be one of"),
-        (result(), {"threshold": -1.0}, "threshold = -1 must be greater than 0"),
-        (result(), {"layers": 20}, "layers = 20 must lie between 0 and 8"),
-        (result(), {"block": 0}, "block = 0 must lie between 1"),
-        (result(), {"depth_from": "top"}, "depth_from = 'top' must be 'echo' or 'mean'"),
-        (result(), {"noise": [1.0, 2.0]}, r"noise of shape \(2,\) must be a number"),
-        (recorded(np.stack([waveform()]), 2, 0.1).isel(time=slice(60, None)), {}, "at least 4 bins before"),
-    ],
+@refuses(
+    (result().transpose("time", "pixel"), {}, r"waveform has the dimensions \('time', 'pixel'\)"),
+    (result().drop_vars("pixel"), {}, "the dataset has no coordinate pixel"),
+    (result().drop_vars("time"), {}, "the dataset has no coordinate time"),
+    (result().drop_vars("waveform"), {}, "must have waveforms over time or signals of a receiver"),
+    (drop("altitude"), {}, "the dataset has no attribute altitude"),
+    (drop("pulse_fwhm_ns"), {}, "the dataset has no attribute pulse_fwhm_ns"),
+    (result(np.full((1, BINS), np.nan)), {}, "waveform holds values that are not finite"),
+    (result(), {"estimators": "best"}, "estimator 'best' must be one of"),
+    (result(), {"estimators": []}, "estimator '' must be one of"),
+    (result(), {"threshold": -1.0}, "threshold = -1 must be greater than 0"),
+    (result(), {"layers": 20}, "layers = 20 must lie between 0 and 8"),
+    (result(), {"block": 0}, "block = 0 must lie between 1"),
+    (result(), {"depth_from": "top"}, "depth_from = 'top' must be 'echo' or 'mean'"),
+    (result(), {"noise": [1.0, 2.0]}, r"noise of shape \(2,\) must be a number"),
+    (recorded(np.stack([waveform()]), 2, 0.1).isel(time=slice(60, None)), {}, "at least 4 bins before"),
 )
-def test_invalid_input(dataset, options, sentence):
-    with pytest.raises(UserError, match=sentence) as refused:
-        echo_table.extract(dataset, **options)
-    assert "\n" not in str(refused.value)
+def test_invalid_input(dataset, options):
+    echo_table.extract(dataset, **options)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rows import refuses
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
@@ -193,18 +194,14 @@ def write_response(folder, times, values):
     (folder / "response.csv").write_text(f"time_ns,response\n{rows}\n")
 
 
-@pytest.mark.parametrize(
-    ("times", "values", "message"),
-    [
-        (np.arange(5.0) + 1, [0, 1, 2, 1, 0], "must hold 0, the arrival of the light"),
-        (np.arange(5.0), [0, 1, 2, 1, 1], "where it must be 0 within 2 %"),
-        (np.arange(5.0), [0, -1, -2, -1, 0], "must have a positive area"),
-    ],
+@refuses(
+    (np.arange(5.0) + 1, [0, 1, 2, 1, 0], "must hold 0, the arrival of the light"),
+    (np.arange(5.0), [0, 1, 2, 1, 1], "where it must be 0 within 2 %"),
+    (np.arange(5.0), [0, -1, -2, -1, 0], "must have a positive area"),
 )
-def test_responses_without_zero_are_refused(tmp_path, times, values, message):
+def test_responses_without_zero_are_refused(times, values, tmp_path):
     write_response(tmp_path, times, values)
-    with pytest.raises(UserError, match=message):
-        parse_receiver('preset = "apd"\n[amplifier]\nimpulse_response = "response.csv"', "own.toml", tmp_path)
+    parse_receiver('preset = "apd"\n[amplifier]\nimpulse_response = "response.csv"', "own.toml", tmp_path)
 
 
 def test_a_measured_single_pole_is_the_single_pole(tmp_path):

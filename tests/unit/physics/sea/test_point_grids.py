@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables import text_tables
@@ -46,28 +46,24 @@ def test_points_without_a_height_are_left_out(tmp_path, missing, caplog):
     assert f"{tmp_path}/a.csv: 1 of 16 points have no height and are left out" in caplog.messages
 
 
-@each_row(
-    ("text", "message"),
-    [
-        ("", "has no rows of numbers"),
-        ("1 2\n3 4\n", "is not a table of x, y, z: line 1 has 2 values, '1 2'"),
-        ("1 2 3\n4 x 6\n", "is not a table of x, y, z: line 2 is '4 x 6'"),
-        ("1 2 3\n4 5 6 7\n", "is not a table of x, y, z: line 2 is '4 5 6 7'"),
-        ("x,y,z\n1,5,2,5,-3,2\n1,5,3,5,-3,2\n", "line 2 has 6 values, '1 5 2 5 -3 2'"),
-        ("x,y,z\n1,5,2,-3\n", "line 2 has 4 values, '1 5 2 -3'"),
-        ("name depth\n1 2\n", r"has no heading with known columns \(found: name, depth\): allowed are x, y, z"),
-        ("1 2 3\n\n# a\n1 inf 3\n", "line 4: the point 1, inf, 3 must be finite"),
-        ("1 2 3\n" * 7, "has more than 5 rows"),
-        ("x,y,easting,z\n1,2,3,4\n", "has 2 columns x and easting that may be x: allowed is one"),
-        ("x,y,z_std\n1,2,3\n", "has no column z or depth"),
-        ("x_m,y_ft,z\n1,2,3\n", "has x in m and y in ft: they must be the same"),
-    ],
+@refuses(
+    ("", "has no rows of numbers"),
+    ("1 2\n3 4\n", "is not a table of x, y, z: line 1 has 2 values, '1 2'"),
+    ("1 2 3\n4 x 6\n", "is not a table of x, y, z: line 2 is '4 x 6'"),
+    ("1 2 3\n4 5 6 7\n", "is not a table of x, y, z: line 2 is '4 5 6 7'"),
+    ("x,y,z\n1,5,2,5,-3,2\n1,5,3,5,-3,2\n", "line 2 has 6 values, '1 5 2 5 -3 2'"),
+    ("x,y,z\n1,5,2,-3\n", "line 2 has 4 values, '1 5 2 -3'"),
+    ("name depth\n1 2\n", r"has no heading with known columns \(found: name, depth\): allowed are x, y, z"),
+    ("1 2 3\n\n# a\n1 inf 3\n", "line 4: the point 1, inf, 3 must be finite"),
+    ("1 2 3\n" * 7, "has more than 5 rows"),
+    ("x,y,easting,z\n1,2,3,4\n", "has 2 columns x and easting that may be x: allowed is one"),
+    ("x,y,z_std\n1,2,3\n", "has no column z or depth"),
+    ("x_m,y_ft,z\n1,2,3\n", "has x in m and y in ft: they must be the same"),
 )
-def test_other_tables_are_refused(tmp_path, monkeypatch, text, message):
+def test_other_tables_are_refused(text, tmp_path, monkeypatch):
     monkeypatch.setattr(text_tables, "_MOST_ROWS", 5)
     (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(UserError, match=message):
-        read_points(tmp_path / "a.csv")
+    read_points(tmp_path / "a.csv")
 
 
 def test_a_table_of_a_billion_points_is_refused_by_its_size(tmp_path):
@@ -131,18 +127,14 @@ def test_cells_outside_the_hull_are_holes_that_do_not_cover(tmp_path):
     assert read.covers(np.zeros((2, 3)), np.full((2, 3), np.nan)).tolist() == [[False] * 3] * 2
 
 
-@each_row(
-    ("points", "options", "message"),
-    [
-        ([[0, 0, 1], [1, 1, 1]], {}, "has 2 points: a height map needs at least 3"),
-        ([[0, 0, 1], [1, 1, 1], [2, 2, 1], [3.5, 3.5, 1]], {}, "has points on a line"),
-        (np.eye(3), {"cell": 0.6}, r"map_cell = 0.6 must be at most half of 1 m, the extent"),
-        (np.eye(3), {"cell": 0.0}, "map_cell = 0 must be greater than 0"),
-        (1e4 * np.eye(3), {"cell": 1.0}, r"holds arrays of 763.* MiB, and 256 MiB are the most"),
-        (np.eye(3), {"size": 1.0}, "size = 1.0 must not be given"),
-    ],
+@refuses(
+    ([[0, 0, 1], [1, 1, 1]], {}, "has 2 points: a height map needs at least 3"),
+    ([[0, 0, 1], [1, 1, 1], [2, 2, 1], [3.5, 3.5, 1]], {}, "has points on a line"),
+    (np.eye(3), {"cell": 0.6}, r"map_cell = 0.6 must be at most half of 1 m, the extent"),
+    (np.eye(3), {"cell": 0.0}, "map_cell = 0 must be greater than 0"),
+    (1e4 * np.eye(3), {"cell": 1.0}, r"holds arrays of 763.* MiB, and 256 MiB are the most"),
+    (np.eye(3), {"size": 1.0}, "size = 1.0 must not be given"),
 )
-def test_points_that_are_no_map_are_refused(tmp_path, points, options, message):
+def test_points_that_are_no_map_are_refused(points, options, tmp_path):
     path = write_points(tmp_path / "a.xyz", points)
-    with pytest.raises(UserError, match=message):
-        read_height_map(path, **options)
+    read_height_map(path, **options)

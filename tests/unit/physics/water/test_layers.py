@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import refuses
 
 from mitransient_lidar.physics.water.layers import WaterColumn
 
@@ -49,18 +49,14 @@ def test_level_and_nearly_level_segments_agree(layered):
     assert layered.optical_depth(3.0, 3.0, 10.0) == 5.0
 
 
-@each_row(
-    ("arguments", "message"),
-    [
-        (([0, 2, 2], 0.3, 0.15, 0.006), "out of order"),
-        ((1, 0.3, 0.15, 0.006), "first layer must start at 0"),
-        ((0, 0.3, 0.4, 0.006), r"scattering = 0.4 must not exceed attenuation = 0.3"),
-        ((0, 0.3, 0.15, 0.5), r"backscattering = 0.5 must not exceed scattering = 0.15"),
-        ((0, np.nan, 0.15, 0.006), "attenuation holds nan"),
-        (("0, deep", 0.3, 0.15, 0.006), "layer_tops .* must hold numbers only"),
-        (([0, 1, 2], [0.3, 0.4], 0.15, 0.006), "attenuation has 2 values but layer_tops has 3 layers"),
-    ],
+@refuses(
+    (([0, 2, 2], 0.3, 0.15, 0.006), "out of order"),
+    ((1, 0.3, 0.15, 0.006), "first layer must start at 0"),
+    ((0, 0.3, 0.4, 0.006), r"scattering = 0.4 must not exceed attenuation = 0.3"),
+    ((0, 0.3, 0.15, 0.5), r"backscattering = 0.5 must not exceed scattering = 0.15"),
+    ((0, np.nan, 0.15, 0.006), "attenuation holds nan"),
+    (("0, deep", 0.3, 0.15, 0.006), "layer_tops .* must hold numbers only"),
+    (([0, 1, 2], [0.3, 0.4], 0.15, 0.006), "attenuation has 2 values but layer_tops has 3 layers"),
 )
-def test_bad_layers_are_rejected(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        WaterColumn.from_text(*arguments)
+def test_bad_layers_are_rejected(arguments):
+    WaterColumn.from_text(*arguments)

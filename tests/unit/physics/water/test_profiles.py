@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from rows import each_row
+from rows import each_row, refuses
 from scipy.integrate import quad
 
 from mitransient_lidar.core.errors import UserError
@@ -185,39 +185,35 @@ def test_units_of_netcdf_variables(tmp_path):
         read_profile(path)
 
 
-@each_row(
-    ("text", "message"),
-    [
-        ("", r"water.csv has no heading with known columns \(found: none\): allowed are depth, z \[m, cm, "),
-        ("a,b\n0,0\n0,0", "has the columns a, b: needed are depth or z and two of a, b, c, omega"),
-        ("depth,z,a,b\n0,0,0,0", "has the columns depth, z, a, b: needed are depth or z and two"),
-        ("depth,c,bb\n0,1,0\n1,1,0", "has the columns depth, c, bb: needed are depth or z and two of a, b, c, omega"),
-        ("depth,a,b,bbp\n0,0,0,0\n", r"unknown column 'bbp' \(found: depth, a, b, bbp\): .* a, b, c, bb \[1/m, .*\]"),
-        ("depth,a,b,bb,bb_ratio\n0,0,0,0,0\n", "columns bb and bb_ratio, but must have only one"),
-        ("depth,a,b\n0,1,1\n", "has 1 depths but a profile must have at least 2"),
-        ("depth,a,b\n# x\n0,1,1\n1,1\n", r"water.csv, line 4 has 2 values but must have 3, one for each column$"),
-        ("z,a,b\n-1,1,1\n1,1,1\n", "line 2: z = -1 must not be negative, unless all z are heights of at most 0"),
-        ("depth,a,b\n-1,1,1\n1,1,1\n", "line 2: depth = -1 must not be negative"),
-        ("z,a,b\n0,1,1\n-2,1,1\n-9999,1,1\n", "line 4: 1 depths of 9999 m, far from all others, must not stand for"),
-        ("depth_km,a,b\n0,1,1\n13,1,1\n", "line 3: 1 depths of 13000 m, beyond 12000 m, must not stand for missing"),
-        ("depth,a,b\n0,1,1\n\n2,1,1\n1,inf,1\n", "line 5: a = inf must be finite"),
-        ("depth,a,b\n0,1,1\n2,-0.1,1\n", "line 3: a = -0.1 must not be negative"),
-        ("depth,b,c\n0,1,1\n2,0.4,0.3\n", "line 3: b = 0.4 1/m must not exceed c = 0.3 1/m"),
-        ("depth,a,c\n0,1,1\n2,0.4,0.3\n", "line 3: a = 0.4 1/m must not exceed c = 0.3 1/m"),
-        ("depth,a,b,bb\n0,1,1,0\n2,1,0.4,0.5\n", "line 3: bb = 0.5 1/m must not exceed b = 0.4 1/m"),
-        ("depth,a,b,bb_ratio\n0,1,1,0\n2,1,0.4,1.1\n", "line 3: bb_ratio = 1.1 must lie between 0 and 1"),
-        ("depth,c,omega\n0,1,1.01\n2,1,1\n", "line 2: omega = 1.01 must lie between 0 and 1"),
-        ("depth,a,omega\n0,1,1\n2,1,1\n", "line 2: omega = 1 must be below 1 if b is to follow from a = 1 1/m"),
-        ("depth,b,omega\n0,1,0\n2,1,1\n", "line 2: omega = 0 must be greater than 0 if a is to follow from b = 1 1/m"),
-        ("depth,a,b,c\n0,1,1,2\n2,1,1,2.1\n", "line 3: c = 2.1 contradicts a = 1 and b = 1, which give 2"),
-        ("depth,b,c,omega\n0,1,2,0.5\n2,1,2,0.55\n", "line 3: omega = 0.55 contradicts b = 1 and c = 2, which give"),
-    ],
+@refuses(
+    ("", r"water.csv has no heading with known columns \(found: none\): allowed are depth, z \[m, cm, "),
+    ("a,b\n0,0\n0,0", "has the columns a, b: needed are depth or z and two of a, b, c, omega"),
+    ("depth,z,a,b\n0,0,0,0", "has the columns depth, z, a, b: needed are depth or z and two"),
+    ("depth,c,bb\n0,1,0\n1,1,0", "has the columns depth, c, bb: needed are depth or z and two of a, b, c, omega"),
+    ("depth,a,b,bbp\n0,0,0,0\n", r"unknown column 'bbp' \(found: depth, a, b, bbp\): .* a, b, c, bb \[1/m, .*\]"),
+    ("depth,a,b,bb,bb_ratio\n0,0,0,0,0\n", "columns bb and bb_ratio, but must have only one"),
+    ("depth,a,b\n0,1,1\n", "has 1 depths but a profile must have at least 2"),
+    ("depth,a,b\n# x\n0,1,1\n1,1\n", r"water.csv, line 4 has 2 values but must have 3, one for each column$"),
+    ("z,a,b\n-1,1,1\n1,1,1\n", "line 2: z = -1 must not be negative, unless all z are heights of at most 0"),
+    ("depth,a,b\n-1,1,1\n1,1,1\n", "line 2: depth = -1 must not be negative"),
+    ("z,a,b\n0,1,1\n-2,1,1\n-9999,1,1\n", "line 4: 1 depths of 9999 m, far from all others, must not stand for"),
+    ("depth_km,a,b\n0,1,1\n13,1,1\n", "line 3: 1 depths of 13000 m, beyond 12000 m, must not stand for missing"),
+    ("depth,a,b\n0,1,1\n\n2,1,1\n1,inf,1\n", "line 5: a = inf must be finite"),
+    ("depth,a,b\n0,1,1\n2,-0.1,1\n", "line 3: a = -0.1 must not be negative"),
+    ("depth,b,c\n0,1,1\n2,0.4,0.3\n", "line 3: b = 0.4 1/m must not exceed c = 0.3 1/m"),
+    ("depth,a,c\n0,1,1\n2,0.4,0.3\n", "line 3: a = 0.4 1/m must not exceed c = 0.3 1/m"),
+    ("depth,a,b,bb\n0,1,1,0\n2,1,0.4,0.5\n", "line 3: bb = 0.5 1/m must not exceed b = 0.4 1/m"),
+    ("depth,a,b,bb_ratio\n0,1,1,0\n2,1,0.4,1.1\n", "line 3: bb_ratio = 1.1 must lie between 0 and 1"),
+    ("depth,c,omega\n0,1,1.01\n2,1,1\n", "line 2: omega = 1.01 must lie between 0 and 1"),
+    ("depth,a,omega\n0,1,1\n2,1,1\n", "line 2: omega = 1 must be below 1 if b is to follow from a = 1 1/m"),
+    ("depth,b,omega\n0,1,0\n2,1,1\n", "line 2: omega = 0 must be greater than 0 if a is to follow from b = 1 1/m"),
+    ("depth,a,b,c\n0,1,1,2\n2,1,1,2.1\n", "line 3: c = 2.1 contradicts a = 1 and b = 1, which give 2"),
+    ("depth,b,c,omega\n0,1,2,0.5\n2,1,2,0.55\n", "line 3: omega = 0.55 contradicts b = 1 and c = 2, which give"),
 )
-def test_invalid_csv_files_are_rejected(tmp_path, text, message):
+def test_invalid_csv_files_are_rejected(text, tmp_path):
     path = tmp_path / "water.csv"
     path.write_text(text)
-    with pytest.raises(ValueError, match=message):
-        read_profile(path)
+    read_profile(path)
 
 
 def test_rounded_decimals_do_not_contradict(tmp_path):
@@ -267,17 +263,13 @@ def test_invalid_netcdf_files_are_rejected(tmp_path):
         read_profile(path)
 
 
-@each_row(
-    ("arguments", "message"),
-    [
-        (([0], [1], [1], [0]), r"depth of shape \(1,\) must be a list of one value per depth, of 2 depths or more"),
-        (([0, 1], [1, 1, 1], [1, 1], [0, 0]), r"absorption of shape \(3,\) must be a list of one value per depth"),
-        (([0, 1], [1, np.nan], [1, 1], [0, 0]), "absorption holds nan"),
-        (([0, 1], [1, -1], [1, 1], [0, 0]), r"absorption = -1 must not be negative, in row 1 counted from 0\.$"),
-        (([1, 0], [1, 1], [1, 1], [0, 0]), "depth = 0 m follows 1 m but depths must increase, in row 1"),
-        (([0, 1], [1, 1], [1, 1], [0, 2]), "bb = 2 1/m must not exceed b = 1 1/m, in row 1"),
-    ],
+@refuses(
+    (([0], [1], [1], [0]), r"depth of shape \(1,\) must be a list of one value per depth, of 2 depths or more"),
+    (([0, 1], [1, 1, 1], [1, 1], [0, 0]), r"absorption of shape \(3,\) must be a list of one value per depth"),
+    (([0, 1], [1, np.nan], [1, 1], [0, 0]), "absorption holds nan"),
+    (([0, 1], [1, -1], [1, 1], [0, 0]), r"absorption = -1 must not be negative, in row 1 counted from 0\.$"),
+    (([1, 0], [1, 1], [1, 1], [0, 0]), "depth = 0 m follows 1 m but depths must increase, in row 1"),
+    (([0, 1], [1, 1], [1, 1], [0, 2]), "bb = 2 1/m must not exceed b = 1 1/m, in row 1"),
 )
-def test_bad_arrays_are_rejected(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        Profile(*arguments)
+def test_bad_arrays_are_rejected(arguments):
+    Profile(*arguments)
