@@ -83,8 +83,8 @@ def test_foam_over_a_bottom_in_turbid_water(lidar_scene, passes):
 
 
 @pytest.mark.slow
-@each_row("wind, foam", [(5.0, LAWS[0]), (10.0, LAWS[1]), (15.0, LAWS[2]), (15.0, "0.3")])
-def test_mean_surface_echo_is_the_sum_of_its_shares(lidar_scene, passes, wind, foam):
+@each_row((5.0, LAWS[0]), (10.0, LAWS[1]), (15.0, LAWS[2]), (15.0, "0.3"))
+def test_mean_surface_echo_is_the_sum_of_its_shares(wind, foam, lidar_scene, passes):
     """A level sea has the cover everywhere; its water is black."""
     variance = cox_munk(wind)
     scene = lidar_scene(

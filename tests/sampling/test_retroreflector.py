@@ -55,7 +55,7 @@ def test_lobe_of_narrow_width_is_gaussian():
     assert value(bsdf, OBLIQUE, aside) == pytest.approx(peak * np.exp(-0.5), rel=1e-3)
 
 
-@each_row("width", [5.0, 40.0, 180.0])
+@each_row(5.0, 40.0, 180.0)
 def test_is_reciprocal(width):
     bsdf = surface(width_deg=width, diffuse_share=0.2)
     for first, second in ((direction(0.2), direction(0.3, 0.1)), (direction(1.2, 1.0), direction(1.4, 1.3))):

@@ -92,7 +92,7 @@ def test_each_width_is_where_the_irradiance_says(share_of_peak):
     assert abs(outside - share_of_peak) < limit
 
 
-@each_row("name", ["divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad"])
+@each_row("divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad")
 def test_every_width_of_a_top_hat_is_its_full_angle(name):
     """Its irradiance falls from the peak to 0 at the edge, past every share of the peak."""
     beam = laser(beam_profile="top_hat", **{name: 7.0})

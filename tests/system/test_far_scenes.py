@@ -179,7 +179,7 @@ def test_texture_of_a_far_seabed_stays_in_place():
     np.testing.assert_array_equal(*colours)
 
 
-@each_row("stays", ["near", "loaded", "unknown"])
+@each_row("near", "loaded", "unknown")
 def test_near_scenes_and_those_of_unknown_places_stay(stays):
     x, y = (240.0, -60.0) if stays == "near" else FAR
     sphere = ball(x, y)

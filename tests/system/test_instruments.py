@@ -112,33 +112,30 @@ def test_the_infrared_channel_gives_the_surface_above_shallow_bottoms():
 
 
 @each_row(
-    ("arguments", "sentence"),
-    [
-        (["render", "table1", "--infrared"], "--instrument = None has no infrared channel; instruments with one are"),
-        (
-            ["render", "table1", "--instrument", "riegl_vq840g", "--infrared"],
-            "--instrument = 'riegl_vq840g' has no infrared channel; instruments with one are",
-        ),
-        (
-            ["render", "table1", "--instrument", "riegl_vq880g2", "--infrared", "-D", "infrared.wavelength_nm=1550"],
-            "wavelength_nm = 1550 must lie between 300 and 1100",
-        ),
-        (
-            ["render", "table1", "--instrument", "riegl_vq880g2", "--infrared", "-D", "infrared.pulse_fwhm_ns="],
-            "pulse_fwhm_ns = '' is empty",
-        ),
-        (["scenes", "instruments", "czmil"], "instrument = 'czmil' is not known; did you mean teledyne_czmil"),
-        (["scenes", "instruments", "--xml"], "--xml needs the name of an instrument"),
-        (["render", "table1", "--instrument", "eye"], "instrument = 'eye' is not known; instruments are icesat2_atlas"),
-        (
-            ["render", "table1", "--instrument", "teledyne_czmil", "-D", "layout=1x1"],
-            "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil",
-        ),
-        (
-            ["render", "table1", "--instrument", "riegl_vq840g", "-D", "aperture=1"],
-            "parameter 'aperture' is not one of scene table1 with instrument riegl_vq840g: did you mean aperture_area",
-        ),
-    ],
+    (["render", "table1", "--infrared"], "--instrument = None has no infrared channel; instruments with one are"),
+    (
+        ["render", "table1", "--instrument", "riegl_vq840g", "--infrared"],
+        "--instrument = 'riegl_vq840g' has no infrared channel; instruments with one are",
+    ),
+    (
+        ["render", "table1", "--instrument", "riegl_vq880g2", "--infrared", "-D", "infrared.wavelength_nm=1550"],
+        "wavelength_nm = 1550 must lie between 300 and 1100",
+    ),
+    (
+        ["render", "table1", "--instrument", "riegl_vq880g2", "--infrared", "-D", "infrared.pulse_fwhm_ns="],
+        "pulse_fwhm_ns = '' is empty",
+    ),
+    (["scenes", "instruments", "czmil"], "instrument = 'czmil' is not known; did you mean teledyne_czmil"),
+    (["scenes", "instruments", "--xml"], "--xml needs the name of an instrument"),
+    (["render", "table1", "--instrument", "eye"], "instrument = 'eye' is not known; instruments are icesat2_atlas"),
+    (
+        ["render", "table1", "--instrument", "teledyne_czmil", "-D", "layout=1x1"],
+        "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil",
+    ),
+    (
+        ["render", "table1", "--instrument", "riegl_vq840g", "-D", "aperture=1"],
+        "parameter 'aperture' is not one of scene table1 with instrument riegl_vq840g: did you mean aperture_area",
+    ),
 )
 def test_wrong_input_is_refused(arguments, sentence, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -44,7 +44,7 @@ def gates():
     return xr.Dataset({"gate_energy": energy, "gate_energy_stderr": energy}, coords)
 
 
-@each_row("name", PUBLIC)
+@each_row(*zip(PUBLIC))
 def test_every_name_is_documented(name):
     assert name in dir(mitransient_lidar)
     if name in FUNCTIONS:
@@ -58,7 +58,7 @@ def test_every_name_is_documented(name):
 
 
 # Images by daylight have no laser, which an instrument replaces.
-@each_row("name", [one for one in FUNCTIONS if "scene" in parameters(one) and one != "render_passive"])
+@each_row(*zip([one for one in FUNCTIONS if "scene" in parameters(one) and one != "render_passive"]))
 def test_parameters_and_an_instrument_go_with_every_scene(name):
     assert {"params", "instrument"} < {*parameters(name)}
 
@@ -70,12 +70,9 @@ def test_a_star_import_leaves_open_alone():
     assert {"render", "GateTrain", "SURVEY_ORDERS"} < set(names)
 
 
-@each_row(
-    ("name", "given"),
-    [(name, one) for name in FUNCTIONS for one in parameters(name) if one in GIVEN and name != "figures"],
-)
-@each_row("value", ["missing.nc", Path("missing.nc"), None, 3, "gates", "other"])
-def test_what_is_given_by_mistake_is_refused_in_a_sentence(name, given, value, tmp_path, monkeypatch):
+@each_row(*[(name, one) for name in FUNCTIONS for one in parameters(name) if one in GIVEN and name != "figures"])
+@each_row("missing.nc", Path("missing.nc"), None, 3, "gates", "other")
+def test_what_is_given_by_mistake_is_refused_in_a_sentence(value, name, given, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     is_default = value is None and parameters(name)[given].default is None
     if is_default or {(name, given), (name, value if isinstance(value, str) else "")} & TAKEN:

@@ -2,7 +2,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from rows import refuses
+from rows import each_row, refuses
 
 from mitransient_lidar.campaigns.design import Campaign, Range
 from mitransient_lidar.campaigns.sweep import render_row
@@ -142,14 +142,11 @@ def test_invalid_campaigns(sections):
     Campaign.of_file(changed(**sections)).table()
 
 
-@pytest.mark.parametrize(
-    ("parameters", "design", "message"),
-    [
-        (94, {"count": 10**7}, "has 10000000 runs of 94 parameters: it may have 100000000 values"),
-        (11, {"kind": "random", "count": 10**7}, "has 10000000 runs of 11 parameters"),
-        (2, {"kind": "grid"}, "has 1000000000000 runs"),
-        (500, {"kind": "grid"}, "it must have 1 to 10000000"),
-    ],
+@each_row(
+    (94, {"count": 10**7}, "has 10000000 runs of 94 parameters: it may have 100000000 values"),
+    (11, {"kind": "random", "count": 10**7}, "has 10000000 runs of 11 parameters"),
+    (2, {"kind": "grid"}, "has 1000000000000 runs"),
+    (500, {"kind": "grid"}, "it must have 1 to 10000000"),
 )
 def test_tables_are_refused_before_they_take_memory(parameters, design, message):
     campaign = Campaign.of_file(

@@ -202,17 +202,17 @@ def test_damaged_values_are_not_read(full, path):
         Store(path)
 
 
-@each_row("name", ["time", "time_input", "pixel", "run", "shot", "layout"])
-@each_row("damage", [flip, Path.unlink])
-def test_damaged_coordinates_are_refused(made, tmp_path, name, damage):
+@each_row("time", "time_input", "pixel", "run", "shot", "layout")
+@each_row(flip, Path.unlink)
+def test_damaged_coordinates_are_refused(damage, name, made, tmp_path):
     path = shutil.copytree(made / "full", tmp_path / "campaign.zarr")
     damage(path / name / "c" / "0")
     with pytest.raises(ValueError, match=r"campaign\.zarr is damaged|checksum"):
         open_campaign(path).load()
 
 
-@each_row("name", ["time", "time_input", "pixel", "run", "shot", "layout", "waveform"])
-def test_a_store_that_has_lost_an_array_is_refused(made, tmp_path, name):
+@each_row("time", "time_input", "pixel", "run", "shot", "layout", "waveform")
+def test_a_store_that_has_lost_an_array_is_refused(name, made, tmp_path):
     path = shutil.copytree(made / "full", tmp_path / "campaign.zarr")
     shutil.rmtree(path / name)
     with pytest.raises(UserError, match=rf"campaign\.zarr is damaged: (it has lost {name}|{name} cannot be read)"):

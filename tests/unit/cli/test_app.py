@@ -80,7 +80,7 @@ def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
     assert results.open(out / "fig09.nc").attrs["interrupted"] == 1
 
 
-@each_row("quiet", [True, False])
+@each_row(True, False)
 def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path, monkeypatch, caplog):
     logger = logging.getLogger("mitransient_lidar")
     before = logger.propagate, logger.level, [*logger.handlers]
@@ -94,12 +94,9 @@ def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path
     assert (logger.propagate, logger.level, logger.handlers) == before
 
 
-@pytest.mark.parametrize(
-    ("command", "describe", "plot"),
-    [
-        ("detect", "describe_detection", "targets:plot_detection"),
-        ("scattering", "describe_scattering", "light:plot_scattering"),
-    ],
+@each_row(
+    ("detect", "describe_detection", "targets:plot_detection"),
+    ("scattering", "describe_scattering", "light:plot_scattering"),
 )
 def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, describe, plot, monkeypatch, tmp_path):
     study = COMMANDS[command].function.partition(":")[0]

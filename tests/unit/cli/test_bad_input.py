@@ -91,7 +91,7 @@ def shows(sentence, value):
     return any(form in sentence for form in forms)
 
 
-@each_row(("scene", "name", "value", "part"), PARAMETERS)
+@each_row(*PARAMETERS)
 def test_parameters_of_scenes(scene, name, value, part):
     with pytest.raises(UserError, match=re.escape(part)) as caught:
         scenes.open_scene(scene, {name: value})
@@ -101,8 +101,8 @@ def test_parameters_of_scenes(scene, name, value, part):
     assert shows(sentence, value)
 
 
-@each_row(("scene", "name", "value", "part"), PARAMETERS[::12])
-def test_parameters_of_scenes_on_the_command_line(folder, scene, name, value, part):
+@each_row(*PARAMETERS[::12])
+def test_parameters_of_scenes_on_the_command_line(scene, name, value, part, folder):
     result = run("render", scene, "--passes", 2, "-D", f"{name}={value}")
     assert_refused(result, name, part)
     assert shows(result.stderr, value)
@@ -134,26 +134,23 @@ OPTIONS = [
 
 
 @each_row(
-    ("arguments", "part"),
-    [
-        *(((*command, option, value), part) for command, option, value, part in OPTIONS),
-        (["render"], "Missing argument 'SCENE'"),
-        (["render", "table1", "two"], "Got unexpected extra argument"),
-        (["rendr", "table1"], "No such command 'rendr'"),
-        (["--fast"], "No such option: --fast"),
-        (["scenes", "hide"], "No such command 'hide'"),
-        (["render", "tabel1"], "did you mean table1"),
-        (["render", "."], "is a folder"),
-        (["render", "/dev/zero"], "cannot read /dev/zero: it is a device, and only regular files are read"),
-        (["view", "/dev/zero"], "/dev/zero: it is a device"),
-        (["view", "missing.nc"], "missing.nc"),
-        (["echoes", "/dev/zero"], "/dev/zero"),
-        (["scenes", "water", "mud"], "kind = 'mud' must be one of jerlov"),
-        (["compare", "/dev/zero", "/dev/zero"], "/dev/zero: it is a device"),
-        (["gates", "/dev/zero", "--start-ns", 1, "--width-ns", 1, "--count", 1], "/dev/zero"),
-    ],
+    *(((*command, option, value), part) for command, option, value, part in OPTIONS),
+    (["render"], "Missing argument 'SCENE'"),
+    (["render", "table1", "two"], "Got unexpected extra argument"),
+    (["rendr", "table1"], "No such command 'rendr'"),
+    (["--fast"], "No such option: --fast"),
+    (["scenes", "hide"], "No such command 'hide'"),
+    (["render", "tabel1"], "did you mean table1"),
+    (["render", "."], "is a folder"),
+    (["render", "/dev/zero"], "cannot read /dev/zero: it is a device, and only regular files are read"),
+    (["view", "/dev/zero"], "/dev/zero: it is a device"),
+    (["view", "missing.nc"], "missing.nc"),
+    (["echoes", "/dev/zero"], "/dev/zero"),
+    (["scenes", "water", "mud"], "kind = 'mud' must be one of jerlov"),
+    (["compare", "/dev/zero", "/dev/zero"], "/dev/zero: it is a device"),
+    (["gates", "/dev/zero", "--start-ns", 1, "--width-ns", 1, "--count", 1], "/dev/zero"),
 )
-def test_commands_and_options(folder, arguments, part):
+def test_commands_and_options(arguments, part, folder):
     assert_refused(run(*arguments), part)
 
 
@@ -174,34 +171,31 @@ def replaced(old, new):
 
 
 @each_row(
-    ("change", "part"),
-    [
-        (without("sensor"), "sensor: the scene has none"),
-        (without("emitter"), "emitters: the scene has 0 of which 0 are lidar_transmitter"),
-        (without("film"), "film: sensor 'receiver' has none; add a time_gated_film"),
-        (without("medium"), "ocean_surface 'surface': needs a layered_water as its interior medium"),
-        (without("integrator"), "integrator: the scene has no lidar integrator"),
-        (replaced("<film", '<float name="apertur_area" value="1"/><film'), "did you mean aperture_area"),
-        (
-            replaced('id="transmitter"/>', 'id="transmitter"><float name="divergense" value="1"/></emitter>'),
-            "divergense",
-        ),
-        (replaced('<float name="bin_width_ns"', '<float name="bin_with"'), "time_gated_film: there is no parameter"),
-        (replaced('name="wind_speed" value="3"', 'name="wind_speed" value=""'), "wind_speed = '' is empty"),
-        (replaced('"$bottom_reflectance"', '"1.2"'), "reflectance = 1.2 must lie between 0 and 1"),
-        (replaced('type="sediment"', 'type="sedimnt"'), "did you mean sediment"),
-        (replaced('type="lidar_transmitter"', 'type="lidar_transmiter"'), "did you mean lidar_transmitter"),
-        (replaced('"-$bottom_depth"', '"-$bottom_dept"'), "z = '-$bottom_dept' refers to an unknown parameter"),
-        (replaced('name="wind_speed" value="3"', 'name="wind_speed" value="inf"'), "wind_speed = inf must be finite"),
-        (replaced('<scale value="500"/>', '<scale value="0"/>'), "scale = 0 must be greater than 0"),
-        (replaced("<film", "<fillm"), "not well-formed"),
-        (replaced('"3.0.0">', '"3.0.0"><bsdf type="diffuse" id="receiver"/>'), "duplicate"),
-        (lambda text: "", "not well-formed XML"),
-        (lambda text: '<shape type="sphere" version="3.0.0"/>', "has a root element <shape>: it must be <scene>"),
-        (lambda text: f"<scene version='3.0.0'>{'<shape>' * 50_000}{'</shape>' * 50_000}</scene>", "more than 64 deep"),
-    ],
+    (without("sensor"), "sensor: the scene has none"),
+    (without("emitter"), "emitters: the scene has 0 of which 0 are lidar_transmitter"),
+    (without("film"), "film: sensor 'receiver' has none; add a time_gated_film"),
+    (without("medium"), "ocean_surface 'surface': needs a layered_water as its interior medium"),
+    (without("integrator"), "integrator: the scene has no lidar integrator"),
+    (replaced("<film", '<float name="apertur_area" value="1"/><film'), "did you mean aperture_area"),
+    (
+        replaced('id="transmitter"/>', 'id="transmitter"><float name="divergense" value="1"/></emitter>'),
+        "divergense",
+    ),
+    (replaced('<float name="bin_width_ns"', '<float name="bin_with"'), "time_gated_film: there is no parameter"),
+    (replaced('name="wind_speed" value="3"', 'name="wind_speed" value=""'), "wind_speed = '' is empty"),
+    (replaced('"$bottom_reflectance"', '"1.2"'), "reflectance = 1.2 must lie between 0 and 1"),
+    (replaced('type="sediment"', 'type="sedimnt"'), "did you mean sediment"),
+    (replaced('type="lidar_transmitter"', 'type="lidar_transmiter"'), "did you mean lidar_transmitter"),
+    (replaced('"-$bottom_depth"', '"-$bottom_dept"'), "z = '-$bottom_dept' refers to an unknown parameter"),
+    (replaced('name="wind_speed" value="3"', 'name="wind_speed" value="inf"'), "wind_speed = inf must be finite"),
+    (replaced('<scale value="500"/>', '<scale value="0"/>'), "scale = 0 must be greater than 0"),
+    (replaced("<film", "<fillm"), "not well-formed"),
+    (replaced('"3.0.0">', '"3.0.0"><bsdf type="diffuse" id="receiver"/>'), "duplicate"),
+    (lambda text: "", "not well-formed XML"),
+    (lambda text: '<shape type="sphere" version="3.0.0"/>', "has a root element <shape>: it must be <scene>"),
+    (lambda text: f"<scene version='3.0.0'>{'<shape>' * 50_000}{'</shape>' * 50_000}</scene>", "more than 64 deep"),
 )
-def test_scene_files(tmp_path, folder, change, part):
+def test_scene_files(change, part, tmp_path, folder):
     path = tmp_path / "scene.xml"
     text = re.sub('name="(\\w+)" +value', r'name="\1" value', catalogue.scene_text("table1"))
     path.write_text(change(re.sub(r"<(float|string|integer) +name", r"<\1 name", text)), "utf-8")

@@ -43,8 +43,8 @@ def npy(shape, version=1):
 SHAPES = ("(3, 4", "(3, -4)", "(3, 1e3)", "(3, {)", "(" * 200 + ")" * 200, "(10**9,)", "(3,)")
 
 
-@each_row("data", [*map(npy, SHAPES), npy("(3,)", version=9), b"\x93NUMPY", b""])
-def test_damaged_arrays_are_refused_in_one_sentence(tmp_path, data):
+@each_row(*zip(map(npy, SHAPES)), npy("(3,)", version=9), b"\x93NUMPY", b"")
+def test_damaged_arrays_are_refused_in_one_sentence(data, tmp_path):
     """NumPy's parser raises what Python's does: SyntaxError, TokenError, RecursionError, ..."""
     (tmp_path / "a.npy").write_bytes(data)
     with pytest.raises(UserError, match=r"a\.npy is damaged, or is not one array"):

@@ -48,8 +48,8 @@ def other(request, tmp_path, monkeypatch):
     return path, request.param
 
 
-@each_row("read", [open_file, check_regular, read_text, read_npy])
-def test_only_regular_files_are_opened(other, read):
+@each_row(open_file, check_regular, read_text, read_npy)
+def test_only_regular_files_are_opened(read, other):
     path, reason = other
     with pytest.raises(UserError, match=reason) as caught:
         read(path)
@@ -152,7 +152,7 @@ def test_values_in_a_pipe_are_not_waited_for(tmp_path):
     assert len(refused) == 1
 
 
-@each_row("name", ["", ".", "..", "a/b", "../a", "/a", "a\\b", "a\nb", "a\0", "\x1b[2J", "x" * 201, 3, None])
+@each_row("", ".", "..", "a/b", "../a", "/a", "a\\b", "a\nb", "a\0", "\x1b[2J", "x" * 201, 3, None)
 def test_names_of_more_than_a_file(name):
     assert not is_file_name(name)
 

@@ -28,25 +28,22 @@ def groups(tmp_path, monkeypatch):
 
 
 @each_row(
-    ("own", "limits", "number"),
-    [
-        ("", {}, 16),
-        ("0::/batch/job\n", {"batch__job__cpu_dot_max": "max 100000\n"}, 16),
-        ("0::/batch/job\n", {"batch__job__cpu_dot_max": "200000 100000\n"}, 2),
-        # A part of a processor is one; a group above has the smaller quota; one of more processors than there are.
-        ("0::/batch/job\n", {"batch__job__cpu_dot_max": "20000 100000\n"}, 1),
-        ("0::/batch/job\n", {"batch__job__cpu_dot_max": "max 100000", "batch__cpu_dot_max": "250000 100000\n"}, 3),
-        ("0::/\n", {"cpu_dot_max": "9900000 100000\n"}, 16),
-        # A container of the first version sees its own group as the mount; memory limits no processors.
-        (
-            "7:memory:/a\n3:cpu,cpuacct:/docker/1f\n",
-            {"cpu,cpuacct__cpu_dot_cfs_quota_us": "400000\n", "cpu,cpuacct__cpu_dot_cfs_period_us": "100000\n"},
-            4,
-        ),
-        ("1:cpu:/\n", {"cpu__cpu_dot_cfs_quota_us": "-1\n", "cpu__cpu_dot_cfs_period_us": "100000\n"}, 16),
-    ],
+    ("", {}, 16),
+    ("0::/batch/job\n", {"batch__job__cpu_dot_max": "max 100000\n"}, 16),
+    ("0::/batch/job\n", {"batch__job__cpu_dot_max": "200000 100000\n"}, 2),
+    # A part of a processor is one; a group above has the smaller quota; one of more processors than there are.
+    ("0::/batch/job\n", {"batch__job__cpu_dot_max": "20000 100000\n"}, 1),
+    ("0::/batch/job\n", {"batch__job__cpu_dot_max": "max 100000", "batch__cpu_dot_max": "250000 100000\n"}, 3),
+    ("0::/\n", {"cpu_dot_max": "9900000 100000\n"}, 16),
+    # A container of the first version sees its own group as the mount; memory limits no processors.
+    (
+        "7:memory:/a\n3:cpu,cpuacct:/docker/1f\n",
+        {"cpu,cpuacct__cpu_dot_cfs_quota_us": "400000\n", "cpu,cpuacct__cpu_dot_cfs_period_us": "100000\n"},
+        4,
+    ),
+    ("1:cpu:/\n", {"cpu__cpu_dot_cfs_quota_us": "-1\n", "cpu__cpu_dot_cfs_period_us": "100000\n"}, 16),
 )
-def test_quotas(groups, own, limits, number):
+def test_quotas(own, limits, number, groups):
     groups(own, **limits)
     assert processors.usable_processors() == number
 

@@ -21,22 +21,19 @@ def path(tmp_path):
 
 
 @each_row(
-    "text",
-    [
-        "0,0\n0.5,0.3\n2,1\n",
-        "time (ns), power\n0, 0\n# gap\n0.5\t3e-1\n 2 1 # tail\n",
-        "\ufeff# Laser 7\r\n\r\ntime_ns;power\r\n0;0\r\n0.5;0.3\r\n2;1\r\n",
-        "power\tt [ps]\n0\t0\n0.3\t500\n1\t2000\n",
-        "t / ps   V\n0 0\n500 0.3\n2000 1\n",
-        "TIME [ns]  P [a.u.]\n0 0\n0.5 0.3\n2 1\n",
-        "Instrument 4711\nShots;12\nt;power\nµs;mW\n0;0\n5e-4;0,3\n2e-3;1\n",
-        "# measured in 2024\n# time_s power\n0 0\n5e-10 0.3\n2e-9 1\n",
-        "% a comment\n! another one\n// a third\nns,mV,\n0,0,\n0.5,0.3,\n2,1,\n",
-        "time_ns,power\n0,0\n0.3,NaN\n0.5,0.3\n,4\n2,1\n9,--\n9,n/a\n",
-        '"Time (s)"\t"Power"\n0\t0\n5e-10\t0,3\n2e-9\t1\n',
-    ],
+    "0,0\n0.5,0.3\n2,1\n",
+    "time (ns), power\n0, 0\n# gap\n0.5\t3e-1\n 2 1 # tail\n",
+    "\ufeff# Laser 7\r\n\r\ntime_ns;power\r\n0;0\r\n0.5;0.3\r\n2;1\r\n",
+    "power\tt [ps]\n0\t0\n0.3\t500\n1\t2000\n",
+    "t / ps   V\n0 0\n500 0.3\n2000 1\n",
+    "TIME [ns]  P [a.u.]\n0 0\n0.5 0.3\n2 1\n",
+    "Instrument 4711\nShots;12\nt;power\nµs;mW\n0;0\n5e-4;0,3\n2e-3;1\n",
+    "# measured in 2024\n# time_s power\n0 0\n5e-10 0.3\n2e-9 1\n",
+    "% a comment\n! another one\n// a third\nns,mV,\n0,0,\n0.5,0.3,\n2,1,\n",
+    "time_ns,power\n0,0\n0.3,NaN\n0.5,0.3\n,4\n2,1\n9,--\n9,n/a\n",
+    '"Time (s)"\t"Power"\n0\t0\n5e-10\t0,3\n2e-9\t1\n',
 )
-def test_the_same_samples_in_any_form(path, text):
+def test_the_same_samples_in_any_form(text, path):
     path.write_bytes(text.encode())
     times, values = read_time_samples(path, POWER)
     np.testing.assert_allclose(times, TIMES, rtol=1e-15)

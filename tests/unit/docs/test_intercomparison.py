@@ -61,7 +61,7 @@ def test_every_case_has_a_scene_and_results_have_its_gates():
         np.testing.assert_allclose(found.end, expected[1:], rtol=1e-8)
 
 
-@each_row("name", CASES)
+@each_row(*zip(CASES))
 def test_scene_has_the_values_of_the_table(name):
     case, root = CASES[name], ET.parse(FOLDER / "cases" / f"{name}.xml").getroot()
     receiver, surface = root.find("sensor"), root.find("shape[@type='ocean_surface']")
@@ -106,15 +106,12 @@ def test_score_of_known_differences():
     assert not score.score(result([105, 200, 37, 10], [4, 3, 2, 1]), reference).agrees
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("gate_start_ns,gate_end_ns,energy_j\n0,1,2\n", "no stderr_j"),
-        ("gate_start_ns,gate_end_ns,energy_j,stderr_j\n0,1,nan,0\n", "must be finite"),
-        ("gate_start_ns,gate_end_ns,energy_j,stderr_j\n0,1,1,-1\n", "stderr_j at least 0"),
-        ("gate_start_ns,gate_end_ns,energy_j,stderr_j\n0,1,word,1\n", "word"),
-        ("gate_start_ns,gate_end_ns,energy_j,stderr_j\n0,1,1,1\n", "gates must be those of cases.csv"),
-    ],
+@each_row(
+    ("gate_start_ns,gate_end_ns,energy_j\n0,1,2\n", "no stderr_j"),
+    ("gate_start_ns,gate_end_ns,energy_j,stderr_j\n0,1,nan,0\n", "must be finite"),
+    ("gate_start_ns,gate_end_ns,energy_j,stderr_j\n0,1,1,-1\n", "stderr_j at least 0"),
+    ("gate_start_ns,gate_end_ns,energy_j,stderr_j\n0,1,word,1\n", "word"),
+    ("gate_start_ns,gate_end_ns,energy_j,stderr_j\n0,1,1,1\n", "gates must be those of cases.csv"),
 )
 def test_a_wrong_submission_is_refused_in_one_sentence(text, message, tmp_path):
     (tmp_path / "single_scattering.csv").write_text(text)

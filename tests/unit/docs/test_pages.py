@@ -39,11 +39,7 @@ def test_every_page_is_in_one_table_of_contents() -> None:
     assert set(pages()) - listed == {DOCS / "index.md"}
 
 
-@each_row(
-    "page",
-    [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *pages()],
-    ids=lambda page: page.relative_to(ROOT).as_posix(),
-)
+@each_row(*zip(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *zip(pages()))
 def test_relative_links_lead_to_files(page: Path) -> None:
     text = re.sub(r"^( *)```.*?^\1```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     targets = re.findall(r"\]\(<?([^)\s#>]+)[^)]*\)", text)
@@ -68,12 +64,9 @@ def test_entries_of_the_changelog_are_short_and_sorted() -> None:
 
 
 @each_row(
-    ("word", "page"),
-    [
-        *(("TPU", "guide/uncertainty"), ("S-44", "guide/uncertainty"), ("GPU", "install"), ("macOS", "install")),
-        *(("Windows", "install"), ("tutorial", "gallery/ten_minutes"), ("GeoTIFF", "guide/shore")),
-        *(("bathymetry", "glossary"), ("hydrography", "glossary"), ("shore", "glossary")),
-    ],
+    *(("TPU", "guide/uncertainty"), ("S-44", "guide/uncertainty"), ("GPU", "install"), ("macOS", "install")),
+    *(("Windows", "install"), ("tutorial", "gallery/ten_minutes"), ("GeoTIFF", "guide/shore")),
+    *(("bathymetry", "glossary"), ("hydrography", "glossary"), ("shore", "glossary")),
 )
 def test_words_of_a_search_are_headings_or_terms(word: str, page: str) -> None:
     """The site's search ranks these first."""

@@ -202,8 +202,8 @@ def test_compressed_points_are_those_without_compression(tmp_path: Path, points:
     np.testing.assert_array_equal(compressed["shot"], points["shot"])
 
 
-@each_row("crs", ["EPSG:32633", "EPSG:32633+5773"])
-def test_coordinate_system_by_code(tmp_path: Path, points: xr.Dataset, crs: str) -> None:
+@each_row("EPSG:32633", "EPSG:32633+5773")
+def test_coordinate_system_by_code(crs, tmp_path, points):
     write_points(tmp_path / "points.las", points, crs)
     record = las_reader.read(tmp_path / "points.las").records["LASF_Projection", 2112]
     assert pyproj.CRS.from_wkt(record.rstrip(b"\0").decode()).equals(pyproj.CRS(crs), ignore_axis_order=True)
@@ -358,16 +358,13 @@ def test_wrong_points(
 
 
 @each_row(
-    ("changes", "message"),
-    [
-        ({"gain": 0.0}, "gain = 0 must be greater than 0"),
-        ({"offset": np.nan}, "offset = nan"),
-        ({"sampling_ns": 0.8333}, "sampling_ns = 0.8333 must be a whole number of picoseconds"),
-        ({"sampling_ns": -1.0}, "sampling_ns = -1 must be greater than 0"),
-        ({"gain": 1e-6}, "must lie between -0.05 and 0.015535 V"),
-    ],
+    ({"gain": 0.0}, "gain = 0 must be greater than 0"),
+    ({"offset": np.nan}, "offset = nan"),
+    ({"sampling_ns": 0.8333}, "sampling_ns = 0.8333 must be a whole number of picoseconds"),
+    ({"sampling_ns": -1.0}, "sampling_ns = -1 must be greater than 0"),
+    ({"gain": 1e-6}, "must lie between -0.05 and 0.015535 V"),
 )
-def test_wrong_waveforms(tmp_path: Path, points: xr.Dataset, changes: dict[str, float], message: str) -> None:
+def test_wrong_waveforms(changes, message, tmp_path, points):
     values = waveform_dataset(np.full((SHOTS * PIXELS, SAMPLES), 0.5), **changes)
     with pytest.raises(UserError, match=re.escape(message)):
         write_waveforms(tmp_path / "waveforms.las", points, values)

@@ -5,6 +5,7 @@ import re
 import mitsuba as mi
 import pyproj
 import pytest
+from rows import each_row
 
 from mitransient_lidar import scenes
 from mitransient_lidar.core.errors import UserError
@@ -54,12 +55,8 @@ def test_a_map_lies_where_the_flight_has_its_points(tmp_path, own):
             check_maps(plan, scene)
 
 
-@pytest.mark.parametrize(
-    ("of_map", "beside"),
-    [(32633, None), (25833, None), (23033, "212"), (32632, r"3.48e\+05"), (None, None)],
-    ids=["same", "other name", "other datum", "other zone", "not stated"],
-)
-def test_maps_are_in_the_system_of_the_flight(tmp_path, of_map, beside):
+@each_row((32633, None), (25833, None), (23033, "212"), (32632, r"3.48e\+05"), (None, None))
+def test_maps_are_in_the_system_of_the_flight(of_map, beside, tmp_path):
     """The numbers of the place agree: the bottom of another zone would lie below the flight without a word."""
     if of_map is not None:
         (tmp_path / "step.prj").write_text(pyproj.CRS(of_map).to_wkt("WKT1_ESRI"))
@@ -83,11 +80,10 @@ OWN_SCENE = """<scene version="3.0.0">
 """
 
 
-@pytest.mark.parametrize(
-    ("own", "place"),
-    [("", (500000.0, 6500000.0)), ('<float name="origin_x" value="1"/><float name="origin_y" value="2"/>', (1.0, 2.0))],
+@each_row(
+    ("", (500000.0, 6500000.0)), ('<float name="origin_x" value="1"/><float name="origin_y" value="2"/>', (1.0, 2.0))
 )
-def test_maps_lie_about_the_origin_of_the_flight(tmp_path, own, place):
+def test_maps_lie_about_the_origin_of_the_flight(own, place, tmp_path):
     """A flight replaces defaults before anything is loaded: the file of the default is nowhere."""
     (tmp_path / "step.asc").write_text(GRID)
     (tmp_path / "own.xml").write_text(OWN_SCENE.format(shared=scenes.__path__[0], own=own))

@@ -12,17 +12,14 @@ LINES = {"kind": "lines", "start": [0, 0], "speed": 50, "height": 200, "length":
 
 
 @each_row(
-    ("platform", "last", "system"),
-    [
-        (LINES, 20.0, "flight"),
-        (CSV, 302_410.0, "flight"),
-        (SBET, 302_410.0, "gps_week"),
-        (SBET, 604_810.0, "gps_week"),
-        (CSV, 389_012_346.0, "adjusted_gps"),
-        (SBET, 1_389_012_346.0, "gps"),
-        ({**CSV, "time": "gps_week"}, 302_410.0, "gps_week"),
-        ({**CSV, "time": "gps"}, 1.7e9, "gps"),
-    ],
+    (LINES, 20.0, "flight"),
+    (CSV, 302_410.0, "flight"),
+    (SBET, 302_410.0, "gps_week"),
+    (SBET, 604_810.0, "gps_week"),
+    (CSV, 389_012_346.0, "adjusted_gps"),
+    (SBET, 1_389_012_346.0, "gps"),
+    ({**CSV, "time": "gps_week"}, 302_410.0, "gps_week"),
+    ({**CSV, "time": "gps"}, 1.7e9, "gps"),
 )
 def test_systems_of_times(platform, last, system):
     assert platform_of(platform).time_system(np.array([last - 10, last])) == system

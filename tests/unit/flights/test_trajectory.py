@@ -147,7 +147,7 @@ def test_invalid_records(times, yaw):
     _trajectory(times, yaw)
 
 
-@each_row("time", [-0.1, 1.5, 4.1])
+@each_row(-0.1, 1.5, 4.1)
 def test_times_on_no_line_are_refused(time):
     trajectory = _trajectory(np.arange(5), lines=[(0, 1), (2, 4)])
     with pytest.raises(UserError, match=rf"time = {time:g} s \(number 2\) is on no flight line: .* 0 to 1 s, 2 to 4 s"):

@@ -18,8 +18,6 @@ def _write(path, heading, order, separator=","):
 
 
 @each_row(
-    ("heading", "order", "separator"),
-    [
         ([], NAMES, ","),
         (['#HEADER: "t", "roll", "pitch", "yaw", "x", "y", "z"'], NAMES, ", "),
         (["# a comment", "#TIME_COLUMN: 0", '#HEADER: "t", "x", "y", "z", "yaw", "roll", "pitch"'],
@@ -29,10 +27,8 @@ def _write(path, heading, order, separator=","):
          ("x", "y", "z", "t", "roll", "pitch", "yaw"), ","),
         (["time_s;x_m;y_m;z_m;roll_deg;pitch_deg;heading_deg"],
          ("t", "x", "y", "z", "roll", "pitch", "yaw"), ";"),
-        (["t x y z yaw roll pitch"], ("t", "x", "y", "z", "yaw", "roll", "pitch"), " "),
-    ],
-)  # fmt: skip
-def test_text_in_any_order(tmp_path, heading, order, separator):
+        (["t x y z yaw roll pitch"], ("t", "x", "y", "z", "yaw", "roll", "pitch"), " "),)  # fmt: skip
+def test_text_in_any_order(heading, order, separator, tmp_path):
     records = read_text_records(_write(tmp_path / "flight.trj", heading, order, separator))
     found = np.column_stack([records.time_s, records.roll_deg, records.pitch_deg, records.yaw_deg, records.position])
     np.testing.assert_array_equal(found, ROWS)
@@ -114,8 +110,8 @@ def test_sbet_positions_and_attitudes(tmp_path):
     assert trajectory.rotation_spec == "aerospace"
 
 
-@each_row(("epsg", "north"), [(32633, 60.0), (3006, 60.0), (3035, 60.0), (3413, 70.0), (2180, 60.0), (32661, 84.0)])
-def test_sbet_headings_are_those_of_the_grid(tmp_path, epsg, north):
+@each_row((32633, 60.0), (3006, 60.0), (3035, 60.0), (3413, 70.0), (2180, 60.0), (32661, 84.0))
+def test_sbet_headings_are_those_of_the_grid(epsg, north, tmp_path):
     """A metre along a geodesic with the true heading goes along the heading of the grid."""
     longitude, latitude, heading = (
         np.array([14.0, 17.0, 19.5]),

@@ -18,12 +18,9 @@ def load(scene="table1", **params):
 
 
 @each_row(
-    ("scene", "kind", "value"),
-    [
-        *(("table1", "jerlov", "1C"), ("table1", "chlorophyll", "0.3"), ("table1", "kd", "0.1")),
-        *(("table1", "secchi", "10"), ("table1", "petzold", "coastal"), ("table1", "pure", None)),
-        ("ship_wake", "jerlov", "1C"),
-    ],
+    *(("table1", "jerlov", "1C"), ("table1", "chlorophyll", "0.3"), ("table1", "kd", "0.1")),
+    *(("table1", "secchi", "10"), ("table1", "petzold", "coastal"), ("table1", "pure", None)),
+    ("ship_wake", "jerlov", "1C"),
 )
 def test_waters_by_name_are_those_of_the_command(scene, kind, value):
     water, _, parameters = load(scene, **{kind: "true" if value is None else value})

@@ -25,8 +25,8 @@ def scene_file(folder, old, new):
     return path
 
 
-@each_row("value", [PATH, "/elsewhere/evil", "evil.so", "", "evil\n"])
-def test_types_that_are_paths_are_refused(tmp_path, value):
+@each_row(PATH, "/elsewhere/evil", "evil.so", "", "evil\n")
+def test_types_that_are_paths_are_refused(value, tmp_path):
     written = scene_file(tmp_path, '<integrator type="lidar_merging"/>', f'<integrator type="{value}"/>')
     with pytest.raises(UserError, match="must be the name of a plugin"):
         open_scene(written)
@@ -122,7 +122,7 @@ def test_libraries_in_resources_of_a_dict_or_the_current_folder_are_refused(tmp_
         open_scene({"type": "scene", "shape": {"type": "evil"}})
 
 
-@each_row("plugin", ["blender", "serialized", "irregular", "polarizer", "homogeneous", "point"])
+@each_row("blender", "serialized", "irregular", "polarizer", "homogeneous", "point")
 def test_plugins_that_a_lidar_scene_cannot_have_are_refused(plugin, tmp_path):
     with pytest.raises(UserError, match=f"type = '{plugin}' is not loaded"):
         open_scene({"type": "scene", "shape": {"type": plugin, "filename": "a"}})
@@ -157,7 +157,7 @@ def test_a_dict_with_tensors_is_loaded_twice():
         assert open_scene(scene).scene.shapes()
 
 
-@each_row("name", ["../../elsewhere/important", "/tmp/a", "a/b", "", "..", "a\nb", "\x1b[2J", "x" * 300, 3])
+@each_row("../../elsewhere/important", "/tmp/a", "a/b", "", "..", "a\nb", "\x1b[2J", "x" * 300, 3)
 def test_the_name_of_the_scene_of_a_result_is_that_of_a_file(name):
     """Files of the result's repetition begin with it: a path led out of the folder of ``-o``."""
     with pytest.raises(UserError, match=r"the attribute scene = .* of the result is damaged") as caught:

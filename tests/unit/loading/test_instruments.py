@@ -47,7 +47,7 @@ def values(name):
     return {each.name: each.value for each in catalogue.read_instrument(name).parameters if each.value}
 
 
-@each_row("name", NAMES)
+@each_row(*zip(NAMES))
 def test_every_value_that_is_needed_has_a_source_or_is_assumed(name):
     instrument, given = catalogue.read_instrument(name), values(name)
     assert given.keys() >= NEEDED
@@ -66,7 +66,7 @@ def test_every_value_that_is_needed_has_a_source_or_is_assumed(name):
     assert cited == listed
 
 
-@each_row("name", NAMES)
+@each_row(*zip(NAMES))
 def test_the_loaded_lidar_has_the_values_of_the_file(name):
     given = {key: float(value) for key, value in values(name).items() if key != "layout"}
     transmitter, receiver = parts(scenes.open_scene("table1", FLAT, name).scene)
@@ -141,15 +141,12 @@ def test_files_of_the_scene_are_found_with_an_instrument(tmp_path, monkeypatch):
     assert "rock" in [shape.id() for shape in loaded.shapes()]
 
 
-@pytest.mark.parametrize(
-    ("name", "sentence"),
-    [
-        ("riegl_vq840", "instrument = 'riegl_vq840' is not known; did you mean riegl_vq840g"),
-        ("own.xml", "instrument = 'own.xml' is not known; a lidar of a file is a part of a scene, by <include>"),
-        ("zzz", "instrument = 'zzz' is not known; instruments are icesat2_atlas, .*, usgs_eaarl_b"),
-        (5, "instrument = 5 is not known"),
-        ("../instruments/riegl_vq840g", "is not known"),
-    ],
+@each_row(
+    ("riegl_vq840", "instrument = 'riegl_vq840' is not known; did you mean riegl_vq840g"),
+    ("own.xml", "instrument = 'own.xml' is not known; a lidar of a file is a part of a scene, by <include>"),
+    ("zzz", "instrument = 'zzz' is not known; instruments are icesat2_atlas, .*, usgs_eaarl_b"),
+    (5, "instrument = 5 is not known"),
+    ("../instruments/riegl_vq840g", "is not known"),
 )
 def test_unknown_instruments_are_refused(name, sentence):
     for call in (catalogue.read_instrument, catalogue.instrument_text):

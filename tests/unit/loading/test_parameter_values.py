@@ -22,16 +22,13 @@ PARAMETERS = {
 
 
 @each_row(
-    ("name", "value", "text"),
-    [
-        ("bottom_depth", 8, "8.1"),
-        ("bottom_depth[0]", 8, "8.1"),
-        ("attenuation[1]", 0.5, "0.9, 8.1"),
-        ("layer_tops[1]", 3, "0, 8.1"),
-        # One value for all layers, as a whole and in one of them.
-        ("scattering", 0.25, "8.1"),
-        ("scattering[1]", 0.25, "0.25, 8.1"),
-    ],
+    ("bottom_depth", 8, "8.1"),
+    ("bottom_depth[0]", 8, "8.1"),
+    ("attenuation[1]", 0.5, "0.9, 8.1"),
+    ("layer_tops[1]", 3, "0, 8.1"),
+    # One value for all layers, as a whole and in one of them.
+    ("scattering", 0.25, "8.1"),
+    ("scattering[1]", 0.25, "0.25, 8.1"),
 )
 def test_numbers_are_found_by_name_and_one_changes(name, value, text):
     before = dict(PARAMETERS)
@@ -43,21 +40,18 @@ def test_numbers_are_found_by_name_and_one_changes(name, value, text):
 
 
 @each_row(
-    ("name", "message"),
-    [
-        ("botom_depth", "'botom_depth' is not one of the scene: did you mean bottom_depth"),
-        ("wind", "'wind' is not one of the scene: it has altitude, attenuation, bottom_depth"),
-        ("attenuation[one]", r"'attenuation\[one\]' is not one of the scene"),
-        ("attenuation[-1]", r"'attenuation\[-1\]' is not one of the scene"),
-        ("attenuation", r"attenuation = '0.9, 0.5' is a list: name one of its elements attenuation\[0\] to"),
-        ("attenuation[2]", r"attenuation\[2\]: the index must be 0 to 1, as attenuation = '0.9, 0.5'"),
-        ("scattering[2]", r"scattering\[2\]: the index must be 0 to 1"),
-        ("bottom_depth[1]", r"bottom_depth\[1\]: the index must be 0 to 0"),
-        ("layout", "layout = '2x2' is not a number"),
-        ("jerlov", "jerlov = '' is not a number"),
-        # A value that is no finite number, in the scene or given.
-        ("altitude", "altitude = nan must be finite"),
-    ],
+    ("botom_depth", "'botom_depth' is not one of the scene: did you mean bottom_depth"),
+    ("wind", "'wind' is not one of the scene: it has altitude, attenuation, bottom_depth"),
+    ("attenuation[one]", r"'attenuation\[one\]' is not one of the scene"),
+    ("attenuation[-1]", r"'attenuation\[-1\]' is not one of the scene"),
+    ("attenuation", r"attenuation = '0.9, 0.5' is a list: name one of its elements attenuation\[0\] to"),
+    ("attenuation[2]", r"attenuation\[2\]: the index must be 0 to 1, as attenuation = '0.9, 0.5'"),
+    ("scattering[2]", r"scattering\[2\]: the index must be 0 to 1"),
+    ("bottom_depth[1]", r"bottom_depth\[1\]: the index must be 0 to 0"),
+    ("layout", "layout = '2x2' is not a number"),
+    ("jerlov", "jerlov = '' is not a number"),
+    # A value that is no finite number, in the scene or given.
+    ("altitude", "altitude = nan must be finite"),
 )
 def test_others_are_refused(name, message):
     with pytest.raises(UserError, match=message):

@@ -16,7 +16,7 @@ def test_parameters_are_those_of_the_reference():
     assert references.scene_parameters() == SHIPPED
 
 
-@each_row("name", SHIPPED)
+@each_row(*zip(SHIPPED))
 def test_text_equals_the_file_with_its_includes(name):
     """Mitsuba reads the same plugins with the same parameters in the same order from both."""
     config = mi.parser.ParserConfig(mi.variant())

@@ -165,8 +165,7 @@ RANGES = [
 
 
 @each_row(
-    ("function", "arguments", "name"),
-    [
+    *[
         pytest.param(function, {**valid, name: value}, name, id=f"{function.__qualname__} {name}")
         for function, valid, outside in RANGES
         for name, value in outside.items()

@@ -16,15 +16,12 @@ def image(rows, columns):
     return xr.Dataset(coords={"angle_x": (("row", "column"), angle_x), "angle_y": (("row", "column"), angle_y)})
 
 
-@pytest.mark.parametrize(
-    ("rows", "columns", "extent"),
-    [
-        (4, 5, (1.5, -13.5, -8.0, 8.0)),
-        # The pixels of a single row or column are square.
-        (1, 3, (1.5, -7.5, 4.5, 7.5)),
-        (3, 1, (2.0, -2.0, -4.0, 8.0)),
-        (1, 1, (0.5, -0.5, 5.5, 6.5)),
-    ],
+@each_row(
+    (4, 5, (1.5, -13.5, -8.0, 8.0)),
+    # The pixels of a single row or column are square.
+    (1, 3, (1.5, -7.5, 4.5, 7.5)),
+    (3, 1, (2.0, -2.0, -4.0, 8.0)),
+    (1, 1, (0.5, -0.5, 5.5, 6.5)),
 )
 def test_extent_reaches_half_a_pixel_beyond_the_centres(rows, columns, extent):
     assert drawing.image_extent(image(rows, columns)) == pytest.approx(extent)
@@ -57,8 +54,7 @@ def test_images_are_pictures_taken_from_the_lidar_in_any_order_of_their_pixels()
 
 
 @each_row(
-    ("largest", "factor", "prefix"),
-    [(3.2e-6, 1e-6, "µ"), (999.0, 1.0, ""), (1000.0, 1e3, "k"), (2e-21, 1e-18, "a"), (5e12, 1e9, "G"), (0.0, 1.0, "")],
+    (3.2e-6, 1e-6, "µ"), (999.0, 1.0, ""), (1000.0, 1e3, "k"), (2e-21, 1e-18, "a"), (5e12, 1e9, "G"), (0.0, 1.0, "")
 )
 def test_prefixes_scale_to_between_1_and_1000(largest, factor, prefix):
     assert drawing.si_prefix(largest) == (pytest.approx(factor, rel=1e-12, abs=0), prefix)
@@ -75,15 +71,12 @@ def test_bands_end_at_the_lowest_value():
 
 
 @each_row(
-    ("attributes", "limits"),
-    [
-        # 6 % of the window of 50 ns on both sides, within the record.
-        ({"window_start_ns": 20.0, "window_end_ns": 70.0}, (17.0, 73.0)),
-        ({"window_start_ns": 1.0, "window_end_ns": 101.0}, (0.0, 100.0)),
-        ({"window_start_ns": 200.0, "window_end_ns": 300.0}, (0.0, 100.0)),
-        ({"window_start_ns": 20.0}, (0.0, 100.0)),
-        ({}, (0.0, 100.0)),
-    ],
+    # 6 % of the window of 50 ns on both sides, within the record.
+    ({"window_start_ns": 20.0, "window_end_ns": 70.0}, (17.0, 73.0)),
+    ({"window_start_ns": 1.0, "window_end_ns": 101.0}, (0.0, 100.0)),
+    ({"window_start_ns": 200.0, "window_end_ns": 300.0}, (0.0, 100.0)),
+    ({"window_start_ns": 20.0}, (0.0, 100.0)),
+    ({}, (0.0, 100.0)),
 )
 def test_time_limits_contain_the_window_of_the_echoes(attributes, limits):
     record = xr.Dataset(coords={"time": 0.5 + np.arange(100)}, attrs={"bin_width_ns": 1.0, **attributes})

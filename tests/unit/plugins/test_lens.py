@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.transport.rng import unit_points
 
@@ -49,14 +50,11 @@ def test_fill_factor_keeps_the_pitch():
     assert (inside, gap) == (1, 0)
 
 
-@pytest.mark.parametrize(
-    ("parameters", "words"),
-    [
-        ({"layout": "4x4", "field_of_view_mrad": 3.0}, "field_of_view_mrad = 3"),
-        ({"layout": "4x4", "pixel_pitch_um": 0.0}, "pixel_pitch_um = 0"),
-        ({"layout": "4x4", "focal_length_mm": -1.0}, "focal_length_mm = -1"),
-        ({"layout": "hex7"}, "focal_length_mm = 100"),
-    ],
+@each_row(
+    ({"layout": "4x4", "field_of_view_mrad": 3.0}, "field_of_view_mrad = 3"),
+    ({"layout": "4x4", "pixel_pitch_um": 0.0}, "pixel_pitch_um = 0"),
+    ({"layout": "4x4", "focal_length_mm": -1.0}, "focal_length_mm = -1"),
+    ({"layout": "hex7"}, "focal_length_mm = 100"),
 )
 def test_lenses_that_cannot_be(parameters, words):
     with pytest.raises(Exception, match=words):

@@ -60,10 +60,9 @@ def test_pixels_share_the_light_of_their_area_without_loss(receiver, lidar_scene
 
 
 @each_row(
-    ("name", "kind"),
-    [("map.png", np.uint8), ("map.png", np.uint16), ("map.npy", np.int64), ("map.npy", np.float64), ("map.exr", "f4")],
+    ("map.png", np.uint8), ("map.png", np.uint16), ("map.npy", np.int64), ("map.npy", np.float64), ("map.exr", "f4")
 )
-def test_labels_are_read_as_they_are_written(png, name, kind):
+def test_labels_are_read_as_they_are_written(name, kind, png):
     labels = np.array([[0, 1], [200, 7], [7, 1]], dtype=kind)
     pixels = mi.load_dict({"type": "multipixel_receiver", "pixel_map": png(labels, name)}).receiver.pixels
     assert pixels.names == ["label1", "label7", "label200"]

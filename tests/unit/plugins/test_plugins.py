@@ -125,7 +125,7 @@ REFUSED = {
 }
 
 
-@each_row(("plugin", "given", "message"), [(plugin, *row) for plugin, rows in REFUSED.items() for row in rows])
+@each_row(*[(plugin, *row) for plugin, rows in REFUSED.items() for row in rows])
 def test_invalid_parameters_are_named_in_one_sentence(plugin, given, message):
     with pytest.raises(UserError, match=re.escape(message)) as caught, scenes.as_user_error():
         mi.load_dict({"type": plugin, **given})

@@ -43,20 +43,17 @@ def test_a_reflected_pose_is_refused():
         mi.load_dict({"type": "multipixel_receiver", "to_world": look @ mi.ScalarTransform4f().scale([-1, 1, 1])})
 
 
-@pytest.mark.parametrize(
-    ("sensor", "solid_angle"),
-    [
-        # 0.8 rad across: the tangent-plane area alone would be 12 % and 15 % too large.
-        ({"type": "multipixel_receiver", "field_of_view_mrad": 800.0}, 2 * np.pi * (1 - 1 / np.hypot(1, 0.4))),
-        (
-            {"type": "multipixel_receiver", "field_of_view_mrad": 800.0, "field_of_view_shape": "square"},
-            4 * np.arcsin(0.4**2 / (1 + 0.4**2)),
-        ),
-        (
-            {"type": "pixel_fov", "shape": "ring", "field_of_view_mrad": 800.0, "inner_mrad": 400.0},
-            2 * np.pi * (1 / np.hypot(1, 0.2) - 1 / np.hypot(1, 0.4)),
-        ),
-    ],
+@each_row(
+    # 0.8 rad across: the tangent-plane area alone would be 12 % and 15 % too large.
+    ({"type": "multipixel_receiver", "field_of_view_mrad": 800.0}, 2 * np.pi * (1 - 1 / np.hypot(1, 0.4))),
+    (
+        {"type": "multipixel_receiver", "field_of_view_mrad": 800.0, "field_of_view_shape": "square"},
+        4 * np.arcsin(0.4**2 / (1 + 0.4**2)),
+    ),
+    (
+        {"type": "pixel_fov", "shape": "ring", "field_of_view_mrad": 800.0, "inner_mrad": 400.0},
+        2 * np.pi * (1 / np.hypot(1, 0.2) - 1 / np.hypot(1, 0.4)),
+    ),
 )
 def test_rays_for_mitsubas_integrators_carry_aperture_and_solid_angle(sensor, solid_angle):
     plugin = mi.load_dict(sensor)
@@ -68,7 +65,7 @@ def test_rays_for_mitsubas_integrators_carry_aperture_and_solid_angle(sensor, so
     np.testing.assert_allclose(np.linalg.norm(np.array(ray.d), axis=0), 1, atol=1e-6)
 
 
-@each_row("count", [4096, 5000])
+@each_row(4096, 5000)
 def test_stratified_points_cover_the_square_evenly(count):
     """In 16 x 16 cells 4096 points fall 16 into each, and of 5000 nearly as many: random ones would spread by 4."""
     points = np.array(stratified_point(dr.arange(mi.UInt32, count), count, pass_streams(1, 0, count)))

@@ -52,8 +52,8 @@ def test_unknown_names_are_refused(names, renderer):
     path_parameters(renderer, names)
 
 
-@each_row("water", [{"phase_function": "petzold"}, {"phase_function": "hg", "phase_g": 0.9}])
-def test_backscattering_without_influence_is_refused(lidar_scene, water):
+@each_row({"phase_function": "petzold"}, {"phase_function": "hg", "phase_g": 0.9})
+def test_backscattering_without_influence_is_refused(water, lidar_scene):
     scene = lidar_scene(integrator=FEW, water=water)
     renderer = scene.integrator().prepare(scene, scene.sensors()[0])
     with pytest.raises(UserError, match="backscattering: the light does not depend on it"):

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from rows import refuses
+from rows import each_row, refuses
 
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
@@ -46,16 +46,13 @@ def test_a_pass_is_the_difference_of_two_renders(level):
     assert np.isfinite(found.light.power.stderr).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "shift_ns"),
-    [
-        ("bottom_depth", 2 * 1.34 / 0.299792458),
-        ("altitude", 2 / 0.299792458),
-        # Edges of layers by a tenth.
-        ("layer_tops[1]", 1.34 / 0.299792458),
-    ],
+@each_row(
+    ("bottom_depth", 2 * 1.34 / 0.299792458),
+    ("altitude", 2 / 0.299792458),
+    # Edges of layers by a tenth.
+    ("layer_tops[1]", 1.34 / 0.299792458),
 )
-def test_steps_of_depths_shift_echoes_by_a_twentieth_of_the_pulse(level, name, shift_ns):
+def test_steps_of_depths_shift_echoes_by_a_twentieth_of_the_pulse(name, shift_ns, level):
     session, integrator = level
     renderer = integrator.prepare(session.scene, session.sensor)
     assert default_step(name, 8.0, renderer) * shift_ns == pytest.approx(0.05 * 5.0)
@@ -71,16 +68,13 @@ def test_steps_off_nadir_shift_the_surface_as_much(level):
     assert default_step("off_nadir_deg", 0.0, renderer) == 0.5
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "step"),
-    [
-        ("divergence_mrad", 10, 1.0),
-        ("target_x", 0, 0.05),
-        ("attenuation[1]", 0.5, 0.005),
-        ("wind_direction_deg", 0, 0.5),
-    ],
+@each_row(
+    ("divergence_mrad", 10, 1.0),
+    ("target_x", 0, 0.05),
+    ("attenuation[1]", 0.5, 0.005),
+    ("wind_direction_deg", 0, 0.5),
 )
-def test_steps_of_others(level, name, value, step):
+def test_steps_of_others(name, value, step, level):
     session, integrator = level
     assert default_step(name, value, integrator.prepare(session.scene, session.sensor)) == pytest.approx(step)
 

@@ -66,8 +66,8 @@ def test_the_forecast_is_that_of_the_passes_that_follow(monkeypatch, caplog):
     assert "95 % of the bins of lit pixels reached 0.218; the target takes about 100 passes and 218 s" in caplog.text
 
 
-@each_row(("limit", "expected"), [(1.0, 2), (8.0, 2), (9.0, 3), (10.9, 3), (40.0, 18)])
-def test_no_pass_begins_that_would_end_after_the_time(monkeypatch, limit, expected):
+@each_row((1.0, 2), (8.0, 2), (9.0, 3), (10.9, 3), (40.0, 18))
+def test_no_pass_begins_that_would_end_after_the_time(limit, expected, monkeypatch):
     """The first pass takes 5 s and the others 2 s; two passes are the least."""
     clock = Clock(monkeypatch, 5.0, 2.0)
     log = run_passes(clock.render_pass, Goal(max_time=limit), seed=0)

@@ -62,9 +62,9 @@ class Beam:
         self.pose = KernelPose(*(turn @ vector for vector in (pose.origin, pose.axis, pose.far, pose.left)))
 
 
-@each_row(("k_x", "k_y"), [(0.9, 0.0), (0.3, -0.8), (-0.5, 0.5)])
-@each_row("azimuth", [0.0, 0.7])
-def test_truth_is_the_mean_of_a_wave_over_an_elliptic_gaussian(k_x, k_y, azimuth):
+@each_row((0.9, 0.0), (0.3, -0.8), (-0.5, 0.5))
+@each_row(0.0, 0.7)
+def test_truth_is_the_mean_of_a_wave_over_an_elliptic_gaussian(azimuth, k_x, k_y):
     """In closed form the wave is damped by exp(-(k_a^2 s_a^2 + k_c^2 s_c^2)/2); s_c is 5 mrad of 261 m, s_a longer."""
     x, y, across = 3.17, -8.4, 5e-3 * 200 / math.cos(math.radians(40))
     along = across / math.cos(math.radians(40))
@@ -102,20 +102,17 @@ def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):
 
 
 @each_row(
-    ("water", "depth", "expected"),
-    [
-        # Kd is that of Jerlov's table and b as measured; the rest follows by the sources of `water_types.jerlov`.
-        ({"jerlov": "5C"}, [4.0, np.nan], {"true_kd": 0.3072, "true_scattering": 1.21}),
-        ({"kd": 0.1}, [4.0], {"true_kd": 0.1}),
-        ({"secchi": 10}, [4.0], {"true_kd": 0.17, "true_attenuation": 0.7}),
-        # Petzold's San Diego harbour.
-        ({"petzold": "turbid"}, [4.0], {"true_absorption": 0.366, "true_scattering": 1.824}),
-        # Half of the scattering by molecules is backscattering.
-        ({"pure": "true"}, [4.0], {"true_scattering": 0.00196, "true_backscattering": 0.00098}),
-        # 3 of 8 m are the upper layer.
-        ({"jerlov": "1C, 7C", "layer_tops": "0, 3"}, [8.0], {"true_kd": (3 * 0.1272 + 5 * 0.4816) / 8}),
-        ({"jerlov": "1C, 7C", "layer_tops": "0, 3"}, [np.nan], {"true_kd": np.nan, "true_scattering": np.nan}),
-    ],
+    # Kd is that of Jerlov's table and b as measured; the rest follows by the sources of `water_types.jerlov`.
+    ({"jerlov": "5C"}, [4.0, np.nan], {"true_kd": 0.3072, "true_scattering": 1.21}),
+    ({"kd": 0.1}, [4.0], {"true_kd": 0.1}),
+    ({"secchi": 10}, [4.0], {"true_kd": 0.17, "true_attenuation": 0.7}),
+    # Petzold's San Diego harbour.
+    ({"petzold": "turbid"}, [4.0], {"true_absorption": 0.366, "true_scattering": 1.824}),
+    # Half of the scattering by molecules is backscattering.
+    ({"pure": "true"}, [4.0], {"true_scattering": 0.00196, "true_backscattering": 0.00098}),
+    # 3 of 8 m are the upper layer.
+    ({"jerlov": "1C, 7C", "layer_tops": "0, 3"}, [8.0], {"true_kd": (3 * 0.1272 + 5 * 0.4816) / 8}),
+    ({"jerlov": "1C, 7C", "layer_tops": "0, 3"}, [np.nan], {"true_kd": np.nan, "true_scattering": np.nan}),
 )
 def test_coefficients_of_waters_by_name(water, depth, expected):
     medium = mi.load_dict({"type": "layered_water", **{name: str(value) for name, value in water.items()}})
@@ -230,11 +227,8 @@ def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     assert series.attrs["interrupted"] == 1
 
 
-@pytest.mark.parametrize(
-    ("module", "name", "called"),
-    [(single, "render", "render"), (single, "render_again", "render"), (shot_series, *["render_shots"] * 2)],
-)
-def test_an_interruption_of_the_first_of_two_channels_ends_the_render(monkeypatch, module, name, called):
+@each_row((single, "render", "render"), (single, "render_again", "render"), (shot_series, *["render_shots"] * 2))
+def test_an_interruption_of_the_first_of_two_channels_ends_the_render(module, name, called, monkeypatch):
     calls = []
     function = getattr(module, name)
     monkeypatch.setattr(module, called, lambda *_, **__: calls.append(called) or xr.Dataset(attrs={"interrupted": 1}))

@@ -75,15 +75,12 @@ def test_build_orders_an_imager_row_by_row():
 
 
 @each_row(
-    ("change", "sentence"),
-    [
-        ({"time": TimeAxis(0.0, 0.0, 3)}, "bin_width_ns = 0 must be greater than 0"),
-        ({"time": TimeAxis(float("inf"), 1.0, 3)}, "time_start_ns = inf must be finite"),
-        ({"pixel_names": ["a", "a"]}, "must be 2 different names"),
-        ({"attributes": {"bad": None}}, "attribute bad = None"),
-        ({"attributes": {"bad": ["a", 1]}}, "attribute bad"),
-        ({"attributes": {"bad": 2**63}}, "attribute bad"),
-    ],
+    ({"time": TimeAxis(0.0, 0.0, 3)}, "bin_width_ns = 0 must be greater than 0"),
+    ({"time": TimeAxis(float("inf"), 1.0, 3)}, "time_start_ns = inf must be finite"),
+    ({"pixel_names": ["a", "a"]}, "must be 2 different names"),
+    ({"attributes": {"bad": None}}, "attribute bad = None"),
+    ({"attributes": {"bad": ["a", 1]}}, "attribute bad"),
+    ({"attributes": {"bad": 2**63}}, "attribute bad"),
 )
 def test_build_rejects(change, sentence):
     arguments = {"time": TimeAxis(0.0, 1.0, 3), "pixel_names": ["a", "b"]}
@@ -136,8 +133,8 @@ def test_round_trip(tmp_path, case, suffix):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@each_row("suffix", [".exr", ".nc"])
-def test_files_of_any_name_keep_values_that_are_not_finite_and_other_programs_read_netcdf(tmp_path, suffix):
+@each_row(".exr", ".nc")
+def test_files_of_any_name_keep_values_that_are_not_finite_and_other_programs_read_netcdf(suffix, tmp_path):
     dataset = make()
     dataset["waveform"][0, 0], dataset["waveform"][1, 1] = np.nan, -np.inf
     results.save(dataset, tmp_path / f"a{suffix}")

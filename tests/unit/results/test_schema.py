@@ -43,35 +43,29 @@ def refusal(tmp_path, dataset):
 
 
 @each_row(
-    ("name", "value", "allowed"),
-    [
-        ("altitude", "high", "a number between -1e+30 and 1e+06"),
-        ("altitude", [1.0, 2.0], "a number between"),
-        ("off_nadir_deg", np.inf, "a number between -360 and 180"),
-        ("receiver_pose", [1.0] * 11, "12 finite numbers"),
-        ("receiver_pose", [np.nan] * 12, "12 finite numbers"),
-        ("error_inflation", [1.0, 2.0, 3.0], "2 numbers, as error_inflation_bins"),
-        ("scene", 3, "a text"),
-    ],
+    ("altitude", "high", "a number between -1e+30 and 1e+06"),
+    ("altitude", [1.0, 2.0], "a number between"),
+    ("off_nadir_deg", np.inf, "a number between -360 and 180"),
+    ("receiver_pose", [1.0] * 11, "12 finite numbers"),
+    ("receiver_pose", [np.nan] * 12, "12 finite numbers"),
+    ("error_inflation", [1.0, 2.0, 3.0], "2 numbers, as error_inflation_bins"),
+    ("scene", 3, "a text"),
 )
-def test_attributes_of_another_kind_are_refused(tmp_path, dataset, name, value, allowed):
+def test_attributes_of_another_kind_are_refused(name, value, allowed, tmp_path, dataset):
     told = refusal(tmp_path, dataset.assign_attrs({name: value}))
     assert f"the attribute {name} = " in told
     assert told.endswith(f"it must be {allowed}") or (allowed.endswith("between") and allowed in told)
 
 
 @each_row(
-    ("change", "message"),
-    [
-        (lambda one: one.assign_coords(angle_x=("pixel", ["x", "y"])), "has angle_x with texts: it must hold numbers"),
-        (lambda one: one.assign_coords(angle_y=("pixel", [np.inf, 0])), "has angle_y = inf: it must be finite"),
-        (lambda one: one.assign_coords(angle_x=("other", [0.0, 1])), "has angle_x over (other), not over its pixels"),
-        (lambda one: one.drop_vars("angle_y"), "has one of the coordinates angle_x and angle_y"),
-        (lambda one: one.assign(waveform=one["waveform"].astype(str)), "has waveform with texts"),
-        (lambda one: one.assign(waveform_stderr=one["waveform_stderr"][:, 0]), "has waveform_stderr over (pixel)"),
-    ],
+    (lambda one: one.assign_coords(angle_x=("pixel", ["x", "y"])), "has angle_x with texts: it must hold numbers"),
+    (lambda one: one.assign_coords(angle_y=("pixel", [np.inf, 0])), "has angle_y = inf: it must be finite"),
+    (lambda one: one.assign_coords(angle_x=("other", [0.0, 1])), "has angle_x over (other), not over its pixels"),
+    (lambda one: one.drop_vars("angle_y"), "has one of the coordinates angle_x and angle_y"),
+    (lambda one: one.assign(waveform=one["waveform"].astype(str)), "has waveform with texts"),
+    (lambda one: one.assign(waveform_stderr=one["waveform_stderr"][:, 0]), "has waveform_stderr over (pixel)"),
 )
-def test_arrays_of_another_kind_are_refused(tmp_path, dataset, change, message):
+def test_arrays_of_another_kind_are_refused(change, message, tmp_path, dataset):
     assert message in refusal(tmp_path, change(dataset))
 
 

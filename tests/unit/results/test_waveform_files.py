@@ -222,8 +222,8 @@ WRONG_LAS = {
 }
 
 
-@each_row("case", WRONG_LAS)
-def test_wrong_las_files_are_refused(tmp_path, case):
+@each_row(*zip(WRONG_LAS))
+def test_wrong_las_files_are_refused(case, tmp_path):
     change, message = WRONG_LAS[case]
     las_with(tmp_path / "bad.las")
     change(tmp_path / "bad.las")
@@ -256,8 +256,8 @@ WRONG_PLS = {
 }
 
 
-@each_row("case", WRONG_PLS)
-def test_wrong_pulse_waves_files_are_refused(tmp_path, case):
+@each_row(*zip(WRONG_PLS))
+def test_wrong_pulse_waves_files_are_refused(case, tmp_path):
     change, message = WRONG_PLS[case]
     pls_with(tmp_path / "bad.pls")
     change(tmp_path / "bad.pls")

@@ -122,19 +122,16 @@ def test_interrupted_renders_are_not_kept(monkeypatch, tmp_path):
 
 
 @each_row(
-    ("options", "message"),
-    [
-        ({"free": ["attenuation", "attenuation"]}, "must be a list of different names"),
-        ({"over": {"layout": ["1x1", "1x1"]}}, r"over: layout = \['1x1', '1x1'\] must be a list of different values"),
-        ({"over": {"layuot": ["1x1"]}}, "layuot"),
-        ({"over": {"bin_count": list(range(1001))}}, "over gives 1001 designs: at most 1000"),
-        ({"receiver": "eye"}, "receiver = 'eye' must be one of ideal"),
-        ({"receiver": ["apd", "apd"]}, r"receiver = \['apd', 'apd'\] must be one receiver, or several with different"),
-        ({"receiver": ["apd", "spad"], "gain": "auto"}, "gain = auto needs a receiver with an amplifier, which spad"),
-        ({"nuisances": {"phase": 1}}, "nuisance = 'phase' must be one of time_offset, scale"),
-    ],
+    ({"free": ["attenuation", "attenuation"]}, "must be a list of different names"),
+    ({"over": {"layout": ["1x1", "1x1"]}}, r"over: layout = \['1x1', '1x1'\] must be a list of different values"),
+    ({"over": {"layuot": ["1x1"]}}, "layuot"),
+    ({"over": {"bin_count": list(range(1001))}}, "over gives 1001 designs: at most 1000"),
+    ({"receiver": "eye"}, "receiver = 'eye' must be one of ideal"),
+    ({"receiver": ["apd", "apd"]}, r"receiver = \['apd', 'apd'\] must be one receiver, or several with different"),
+    ({"receiver": ["apd", "spad"], "gain": "auto"}, "gain = auto needs a receiver with an amplifier, which spad"),
+    ({"nuisances": {"phase": 1}}, "nuisance = 'phase' must be one of time_offset, scale"),
 )
-def test_invalid_input_is_refused_before_a_render(rendered, options, message):
+def test_invalid_input_is_refused_before_a_render(options, message, rendered):
     with pytest.raises(UserError, match=message):
         study.bounds("table1", SMALL, **{"free": ["attenuation"], **options})
     assert not rendered

@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.probe import first_along
@@ -88,15 +89,12 @@ def test_instance_returns_the_light_of_what_it_repeats(lidar_scene, integrator):
         assert copy[name] == pytest.approx(energy, rel=0.01), name
 
 
-@pytest.mark.parametrize(
-    ("bsdf", "told"),
-    [
-        ({"type": "bumpmap", "texture": CHECKS, "nested": {"type": "diffuse"}}, r"BumpMap cannot be used"),
-        ({"type": "diffuse", "reflectance": {"type": "blackbody", "temperature": 5000.0}}, "non-spectral"),
-        ({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_a"}}, "no attribute 'vertex_a'"),
-    ],
+@each_row(
+    ({"type": "bumpmap", "texture": CHECKS, "nested": {"type": "diffuse"}}, r"BumpMap cannot be used"),
+    ({"type": "diffuse", "reflectance": {"type": "blackbody", "temperature": 5000.0}}, "non-spectral"),
+    ({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_a"}}, "no attribute 'vertex_a'"),
 )
-def test_bsdfs_that_cannot_be_evaluated_are_refused(lidar_scene, bsdf, told):
+def test_bsdfs_that_cannot_be_evaluated_are_refused(bsdf, told, lidar_scene):
     scene = lidar_scene(extra={"ball": {"type": "sphere", "radius": 0.1, "bsdf": bsdf}})
     with pytest.raises(UserError, match=f"shape 'ball'.*{told}"):
         find_lidar_scene(scene, scene.sensors()[0])

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from oracles.gates import transmission
-from rows import refuses
+from rows import each_row, refuses
 from scipy.integrate import quad
 from scipy.stats import norm
 from small_results import made
@@ -48,15 +48,11 @@ def record(scale=(1.0, 2.0, 0.5), grid=None, relative=0.02, attributes=None, val
     return made(waveform, relative * np.abs(waveform), start=START, step=WIDTH, **places, **about)
 
 
-@pytest.mark.parametrize(
-    "train",
-    [
-        GateTrain(1412.0, 10.0, 5.0, 17),
-        GateTrain(1412.3, 7.77, 3.1, 20),
-        GateTrain(1412.3, 8.0, 3.1, 20, 2.5, 4.0),
-        GateTrain.measured(GateShape.sampled([0, 2, 6, 12], [0, 0.9, 0.7, 0]), 1415.0, 4.0, 15),
-    ],
-    ids=["bins", "sharp", "edges", "measured"],
+@each_row(
+    GateTrain(1412.0, 10.0, 5.0, 17),
+    GateTrain(1412.3, 7.77, 3.1, 20),
+    GateTrain(1412.3, 8.0, 3.1, 20, 2.5, 4.0),
+    GateTrain.measured(GateShape.sampled([0, 2, 6, 12], [0, 0.9, 0.7, 0]), 1415.0, 4.0, 15),
 )
 def test_gates_integrate_the_waveform(train):
     stack = gating.cut_gates(record(), train)

@@ -222,7 +222,7 @@ def test_impossible_steps_are_shortened_and_the_fit_goes_on():
     np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=1e-4)
 
 
-@each_row("complete", [0, 1, 2, 3, 4])
+@each_row(0, 1, 2, 3, 4)
 def test_an_interrupted_fit_has_its_last_step(complete):
     """Ctrl-C in the render after so many, of an approach with a coarse model and of the fit that follows it."""
     renders = []

@@ -255,14 +255,11 @@ def test_tables_of_something_else_are_refused(found):
 
 
 @each_row(
-    ("turn", "first", "second", "share"),
-    [
-        (0, [0, 1, 2, 3, 4], None, 0),
-        (90, [1, 2, 3, 0, 4], None, 0),
-        (-90, [3, 0, 1, 2, 4], None, 0),
-        (45, [0, 1, 2, 3, 4], [1, 2, 3, 0, 4], 0.5),
-        (-60, [0, 1, 2, 3, 4], [3, 0, 1, 2, 4], 2 / 3),
-    ],
+    (0, [0, 1, 2, 3, 4], None, 0),
+    (90, [1, 2, 3, 0, 4], None, 0),
+    (-90, [3, 0, 1, 2, 4], None, 0),
+    (45, [0, 1, 2, 3, 4], [1, 2, 3, 0, 4], 0.5),
+    (-60, [0, 1, 2, 3, 4], [3, 0, 1, 2, 4], 2 / 3),
 )
 def test_turned_pixels_have_the_biases_of_their_places(turn, first, second, share):
     """Four pixels from far left by near left and near right to far right, and one in the middle."""

@@ -32,7 +32,7 @@ def test_other_shapes_are_sums_of_gaussians_within_a_hundredth(fwhm, bin_ns, tau
     assert shape.width_of(np.array([wide]))[0][0] == pytest.approx((half[-1] - half[0]) * bin_ns / 15, rel=0.06)
 
 
-@each_row("name", ["apd", "pmt", "photodiode", "sipm", "ideal"])
+@each_row("apd", "pmt", "photodiode", "sipm", "ideal")
 def test_template_of_a_receiver_is_the_mean_record_of_an_echo(name):
     """Arrival, height and tail of the closed form of the receiver, which does not know of templates."""
     chain, bin_ns = RECEIVERS[name], 1.0
@@ -68,14 +68,11 @@ def test_onset_is_the_blurred_column_and_has_its_derivatives(sigma):
 
 
 @each_row(
-    ("depths", "factors"),
-    [
-        ([1.0, 2.0], [1.0]),
-        ([2.0, 1.0], [1.0, 1.0]),
-        ([1.0, 2.0], [1.0, -1.0]),
-        ("near", [1.0]),
-        ([0.0, 1.0], [2.0, 1.0]),
-    ],
+    ([1.0, 2.0], [1.0]),
+    ([2.0, 1.0], [1.0, 1.0]),
+    ([1.0, 2.0], [1.0, -1.0]),
+    ("near", [1.0]),
+    ([0.0, 1.0], [2.0, 1.0]),
 )
 def test_invalid_focusing_is_refused(depths, factors):
     with pytest.raises(UserError, match="wave_focusing"):

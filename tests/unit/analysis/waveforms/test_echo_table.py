@@ -30,7 +30,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 PLACES = [[], [40], [40, 28], [44, 34, 54]]
 
 
-@each_row("estimator", echo_table.ESTIMATORS)
+@each_row(*zip(echo_table.ESTIMATORS))
 def test_isolated_echoes_without_noise(estimator):
     """Surface and bottom of a lake without a column: times within 0.02 ns, depth within 2 mm."""
     bottom = np.array([50.0, 60.13, 70.29, 80.41])
@@ -198,15 +198,12 @@ def test_csv_and_command(tmp_path):
     xr.testing.assert_equal(xr.load_dataset(tmp_path / "table.nc", engine="h5netcdf"), table)
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (["--estimator", "best"], "estimator 'best' must be one of threshold, leading_edge"),
-        (["--csv", "echoes.txt"], "--csv echoes.txt must end in .csv"),
-        (["--no-table"], "--no-table leaves nothing to do"),
-    ],
+@each_row(
+    (["--estimator", "best"], "estimator 'best' must be one of threshold, leading_edge"),
+    (["--csv", "echoes.txt"], "--csv echoes.txt must end in .csv"),
+    (["--no-table"], "--no-table leaves nothing to do"),
 )
-def test_invalid_options(tmp_path, options, sentence):
+def test_invalid_options(options, sentence, tmp_path):
     results.save(result(), tmp_path / "shot.nc")
     assert_refused(run("echoes", tmp_path / "shot.nc", *options), sentence)
 

@@ -52,7 +52,7 @@ def test_first_light_comes_from_a_crest_at_the_near_edge(off_nadir_deg, crest):
     assert found.first_ns == pytest.approx(2 * NS * (200 - crest) / math.cos(max(edge, 0.0)), rel=1e-6)
 
 
-@each_row(("view", "beam"), [(15.0, 500.0), (500.0, 15.0), (15.0, 15.0)])
+@each_row((15.0, 500.0), (500.0, 15.0), (15.0, 15.0))
 def test_light_is_that_of_directions_in_view_and_beam(view, beam):
     found = lidar(cone(45.0, view), cone(45.0, beam)).limits([plane(1.0)])
     for time, side in zip(found.surface_ns, (-1, 1), strict=True):
@@ -150,7 +150,7 @@ def test_the_column_falls_through_layers():
     assert water(0.0)[1].depth_of(10.0) == 0.0
 
 
-@each_row(("attenuation", "is_seen"), [(0.2, True), (0.5, False)])
+@each_row((0.2, True), (0.5, False))
 def test_an_invisible_bottom(attenuation, is_seen):
     found = lidar(cone(0.0), cone(0.0, 25.0), water(attenuation)).limits([plane(40.0)])
     assert ("bottom" in found.end) == is_seen
@@ -182,13 +182,10 @@ def test_a_square_view_reaches_its_corners():
 
 
 @each_row(
-    ("first", "last", "width", "start", "count"),
-    [
-        (1396.2, 1552.0, 1.0, 1395.0, 160),
-        (-7.0, 33.0, 0.5, -7.0, 80),
-        (1396.2, 1552.0, 0.3, 1392.0, 540),
-        (3.33562e6, 3.33577e6, 1.0, 3335620.0, 150),
-    ],
+    (1396.2, 1552.0, 1.0, 1395.0, 160),
+    (-7.0, 33.0, 0.5, -7.0, 80),
+    (1396.2, 1552.0, 0.3, 1392.0, 540),
+    (3.33562e6, 3.33577e6, 1.0, 3335620.0, 150),
 )
 def test_start_and_number_of_bins_are_readable(first, last, width, start, count):
     axis = TimeAxis.covering(first, last, width)

@@ -75,7 +75,7 @@ def test_height_behind_an_echo():
     assert mean[400] * np.exp(300 / 500) / peak == pytest.approx(1e-3 * (1 + 0.5 * (2.5 / 500) ** 2), rel=1e-6)
 
 
-@each_row("name", ["ideal", "apd", "pmt_log", "sipm", "spad_array"])
+@each_row("ideal", "apd", "pmt_log", "sipm", "spad_array")
 def test_every_function_sees_the_tail(name):
     """Closed forms of records, of detection and of bounds agree on the mean; the tail is in the samples after 60 ns."""
     plain = RECEIVERS[name]

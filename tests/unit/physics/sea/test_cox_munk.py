@@ -20,8 +20,8 @@ def test_cox_munk_totals(wind, total):
     assert up + cross == pytest.approx(total, rel=0.01)
 
 
-@each_row("wind", [1, 3, 10])
-@each_row("kind", [ElfouhailySpectrum, PiersonMoskowitzSpectrum])
+@each_row(1, 3, 10)
+@each_row(ElfouhailySpectrum, PiersonMoskowitzSpectrum)
 def test_matched_waves_leave_ripples_to_every_mesh(kind, wind):
     """Refining the mesh moves variance from the ripples to the facets; nothing is counted twice."""
     matched = MatchedSpectrum(kind(wind, direction=0.5), *cox_munk(wind))

@@ -56,9 +56,9 @@ def test_npy_is_centred_on_the_origin(tmp_path):
     assert_is_the_map(read_height_map(str(path), 6), y=[-2, 0, 2])
 
 
-@each_row("kind", [np.float32, np.float16, np.uint32])
-@each_row(("wanted", "others"), [("depth", []), ("Y", ["stderr"]), ("R", ["G", "B"]), ("Z", ["A"]), ("Y", ["R", "Z"])])
-def test_top_row_of_an_exr_image_has_the_largest_y(tmp_path, kind, wanted, others):
+@each_row(np.float32, np.float16, np.uint32)
+@each_row(("depth", []), ("Y", ["stderr"]), ("R", ["G", "B"]), ("Z", ["A"]), ("Y", ["R", "Z"]))
+def test_top_row_of_an_exr_image_has_the_largest_y(wanted, others, kind, tmp_path):
     zeros = np.zeros(HEIGHTS.shape, dtype=kind)
     path = write_exr(tmp_path / "MAP.EXR", {wanted: HEIGHTS[::-1].astype(kind), **dict.fromkeys(others, zeros)})
     assert_is_the_map(read_height_map(path, 6.0), y=[-2, 0, 2])
@@ -96,34 +96,28 @@ def with_holes():
 
 
 @each_row(
-    ("heights", "size", "message"),
-    [
-        (HEIGHTS, None, "has no positions of its heights: give the size of the map along x, in metres"),
-        (HEIGHTS, 0, "size = 0 must be greater than 0"),
-        *((bad, 1, "has heights of shape") for bad in (HEIGHTS[0], HEIGHTS[:1], HEIGHTS[:, :1], HEIGHTS[None])),
-        (HEIGHTS + 0j, 1, "has heights of type complex128, but they must be real numbers"),
-        (HEIGHTS.astype(str), 1, "has heights of type <U32, but they must be real numbers"),
-        (with_holes(), 1, "has holes, 2 of 12 heights, the first in row 1 and column 3 counted from 0"),
-    ],
+    (HEIGHTS, None, "has no positions of its heights: give the size of the map along x, in metres"),
+    (HEIGHTS, 0, "size = 0 must be greater than 0"),
+    *((bad, 1, "has heights of shape") for bad in (HEIGHTS[0], HEIGHTS[:1], HEIGHTS[:, :1], HEIGHTS[None])),
+    (HEIGHTS + 0j, 1, "has heights of type complex128, but they must be real numbers"),
+    (HEIGHTS.astype(str), 1, "has heights of type <U32, but they must be real numbers"),
+    (with_holes(), 1, "has holes, 2 of 12 heights, the first in row 1 and column 3 counted from 0"),
 )
-def test_invalid_maps_are_rejected(tmp_path, heights, size, message):
+def test_invalid_maps_are_rejected(heights, size, message, tmp_path):
     with pytest.raises(UserError, match=f"^[^\\n]*{message}[^\\n]*$"):
         read_height_map(write_npy(tmp_path / "map.npy", heights), size)
 
 
 @each_row(
-    ("positions", "message"),
-    [
-        ({"x": X}, "has positions x only: it must have both x and y, or none"),
-        ({"x": X[1:], "y": Y}, "has x of shape (3,), but its heights need (4,)"),
-        ({"x": X, "y": np.stack([Y] * 4)}, "has y of shape (4, 3), but its heights need (3,)"),
-        ({"x": X, "y": Y[::-1]}, "has y[0] = 6 and y[1] = 5.5: positions must increase"),
-        ({"x": [0, np.nan, 2, 3], "y": Y}, "has x[1] = nan: positions must be finite"),
-        ({"x": [0, 1, 2, 3.01], "y": Y}, "has x[2] and x[3] 1.01 apart, but 1.00333 on average: positions must"),
-        ({"x": ["a", "b", "c", "d"], "y": Y}, "has x of type <U1, but they must be real numbers"),
-    ],
+    ({"x": X}, "has positions x only: it must have both x and y, or none"),
+    ({"x": X[1:], "y": Y}, "has x of shape (3,), but its heights need (4,)"),
+    ({"x": X, "y": np.stack([Y] * 4)}, "has y of shape (4, 3), but its heights need (3,)"),
+    ({"x": X, "y": Y[::-1]}, "has y[0] = 6 and y[1] = 5.5: positions must increase"),
+    ({"x": [0, np.nan, 2, 3], "y": Y}, "has x[1] = nan: positions must be finite"),
+    ({"x": [0, 1, 2, 3.01], "y": Y}, "has x[2] and x[3] 1.01 apart, but 1.00333 on average: positions must"),
+    ({"x": ["a", "b", "c", "d"], "y": Y}, "has x of type <U1, but they must be real numbers"),
 )
-def test_invalid_positions_are_rejected(tmp_path, positions, message):
+def test_invalid_positions_are_rejected(positions, message, tmp_path):
     path = write_npz(tmp_path / "map.npz", heights=HEIGHTS, **positions)
     with pytest.raises(UserError) as error:
         read_height_map(path)
@@ -179,16 +173,13 @@ def write_ascii_grid(path, rows=HEIGHTS[::-1], **changes):
     return path
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"xllcorner": None, "xllcenter": 499998, "yllcorner": None, "yllcenter": 6000005.5},
-        {"cellsize": None, "dx": 2, "dy": 2, "NODATA_value": None},
-        {"cellsize": "2,0"},
-    ],
+@each_row(
+    {},
+    {"xllcorner": None, "xllcenter": 499998, "yllcorner": None, "yllcenter": 6000005.5},
+    {"cellsize": None, "dx": 2, "dy": 2, "NODATA_value": None},
+    {"cellsize": "2,0"},
 )
-def test_ascii_grid_is_placed_by_its_centre_or_a_point(tmp_path, caplog, changes):
+def test_ascii_grid_is_placed_by_its_centre_or_a_point(changes, tmp_path, caplog):
     path = write_ascii_grid(tmp_path / "map.asc", **changes)
     with caplog.at_level(logging.INFO):
         read = read_height_map(path)
@@ -241,14 +232,11 @@ def test_invalid_ascii_grids_are_rejected(changes, tmp_path):
 
 
 @each_row(
-    ("options", "message"),
-    [
-        ({"size": 6.0}, r"size = 6.0 must not be given: .*map.asc has positions of its own"),
-        ({"origin": (6000007.5, 500001)}, r"origin_x = 6000007.5 must lie within 10 km of .*map.asc, whose x is"),
-        ({"origin": (5e5, 6010009.75)}, r"origin_y = 6010009.75 must lie within 10 km of .* is 6000005.5 to 6000009.5"),
-    ],
+    ({"size": 6.0}, r"size = 6.0 must not be given: .*map.asc has positions of its own"),
+    ({"origin": (6000007.5, 500001)}, r"origin_x = 6000007.5 must lie within 10 km of .*map.asc, whose x is"),
+    ({"origin": (5e5, 6010009.75)}, r"origin_y = 6010009.75 must lie within 10 km of .* is 6000005.5 to 6000009.5"),
 )
-def test_invalid_placements_are_rejected(tmp_path, options, message):
+def test_invalid_placements_are_rejected(options, message, tmp_path):
     with pytest.raises(UserError, match=message):
         read_height_map(write_ascii_grid(tmp_path / "map.asc"), **options)
     with pytest.raises(UserError, match=r"origin_x and origin_y must not be given: .*map.npy has no positions"):

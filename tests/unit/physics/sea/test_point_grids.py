@@ -16,29 +16,26 @@ POINTS = np.array([[1.0, 10.0, -3.0], [2.5, 11.0, -3.5], [4.0, 13.0, -4.0]])
 
 
 @each_row(
-    "text",
-    [
-        "1 10 -3\n2.5 11 -3.5\n4 13 -4\n",
-        "1,10,-3,7\n2.5,11,-3.5,8\n4,13,-4,9\n",
-        "# survey of a bay\nx;y;z\n1;10;-3\n\n2.5;11;-3.5\n4;13;-4\n",
-        "//X Y Z\n1 10 -3\n2.5 11 -3.5\n4 13 -4\n",
-        "\ufeffid,Northing [m],Easting [m],Elevation_m\n1,10,1,-3\n2,11,2.5,-3.5\n3,13,4,-4\n",
-        "station,z,when,x,y\nA1,-3,2024-05-01,1,10\nA2,-3.5,2024-05-01,2.5,11\nA3,-4,2024-05-02,4,13\n",
-        "x;y;z\n1;10;-3\n2,5;11;-3,5\n4;13;-4\n",
-        '"x"\t"y"\t"z"\n"1"\t"10"\t"-3"\n"2,5"\t"11"\t"-3,5"\n"4"\t"13"\t"-4"\n',
-        '"x","y","z"\n"1","10","-3"\n"2,5","11","-3,5"\n4,13,-4\n',
-        " 1  10 -3 # first\n# second\n2,5 11 -3,5\n 4  13 -4\n",
-        "x,y,z\n1,10,-3,\n2.5,11,-3.5,\n4,13,-4,\n",
-        "x,y,z\nm,m,m\n1,10,-3\n2.5,11,-3.5\n4,13,-4\n",
-    ],
+    "1 10 -3\n2.5 11 -3.5\n4 13 -4\n",
+    "1,10,-3,7\n2.5,11,-3.5,8\n4,13,-4,9\n",
+    "# survey of a bay\nx;y;z\n1;10;-3\n\n2.5;11;-3.5\n4;13;-4\n",
+    "//X Y Z\n1 10 -3\n2.5 11 -3.5\n4 13 -4\n",
+    "\ufeffid,Northing [m],Easting [m],Elevation_m\n1,10,1,-3\n2,11,2.5,-3.5\n3,13,4,-4\n",
+    "station,z,when,x,y\nA1,-3,2024-05-01,1,10\nA2,-3.5,2024-05-01,2.5,11\nA3,-4,2024-05-02,4,13\n",
+    "x;y;z\n1;10;-3\n2,5;11;-3,5\n4;13;-4\n",
+    '"x"\t"y"\t"z"\n"1"\t"10"\t"-3"\n"2,5"\t"11"\t"-3,5"\n"4"\t"13"\t"-4"\n',
+    '"x","y","z"\n"1","10","-3"\n"2,5","11","-3,5"\n4,13,-4\n',
+    " 1  10 -3 # first\n# second\n2,5 11 -3,5\n 4  13 -4\n",
+    "x,y,z\n1,10,-3,\n2.5,11,-3.5,\n4,13,-4,\n",
+    "x,y,z\nm,m,m\n1,10,-3\n2.5,11,-3.5\n4,13,-4\n",
 )
-def test_points_have_the_columns_that_their_heading_names(tmp_path, text):
+def test_points_have_the_columns_that_their_heading_names(text, tmp_path):
     (tmp_path / "a.xyz").write_text(text, "utf-8")
     np.testing.assert_array_equal(read_points(tmp_path / "a.xyz")[0], POINTS)
 
 
-@each_row("missing", ["", "NA", "nan", "N/A", "#N/A", "null", "--", " "])
-def test_points_without_a_height_are_left_out(tmp_path, missing, caplog):
+@each_row("", "NA", "nan", "N/A", "#N/A", "null", "--", " ")
+def test_points_without_a_height_are_left_out(missing, tmp_path, caplog):
     rows = "\n".join(f"{x},{y},{-5 if x + y else missing}" for x in range(4) for y in range(4))
     (tmp_path / "a.csv").write_text(f"x,y,z\n{rows}\n")
     assert np.isnan(read_points(tmp_path / "a.csv")[0][0, 2])

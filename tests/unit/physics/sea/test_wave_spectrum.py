@@ -77,10 +77,7 @@ def elfouhaily_written_out(wind):
     return density, delta, peak
 
 
-@pytest.mark.parametrize(
-    ("wind", "height", "wavelength", "up", "cross"),
-    [(3, 0.232, 8.2, 0.01545, 0.00998), (6, 0.937, 32.7, 0.02170, 0.01478), (10, 2.633, 90.8, 0.03551, 0.02480)],
-)
+@each_row((3, 0.232, 8.2, 0.01545, 0.00998), (6, 0.937, 32.7, 0.02170, 0.01478), (10, 2.633, 90.8, 0.03551, 0.02480))
 def test_elfouhaily_totals(wind, height, wavelength, up, cross):
     spectrum = ElfouhailySpectrum(wind)
     assert significant_wave_height(spectrum) == pytest.approx(height, abs=5.1e-4)
@@ -97,7 +94,7 @@ def test_elfouhaily_against_the_formula(wind):
     assert spectrum.peak_wavenumber == pytest.approx(peak)
 
 
-@each_row(("fetch", "heights"), [(20e3, (0.158, 0.405, 0.723)), (100e3, (0.217, 0.674, 1.43))], ids=["20km", "100km"])
+@each_row((20e3, (0.158, 0.405, 0.723)), (100e3, (0.217, 0.674, 1.43)))
 def test_elfouhaily_heights_at_a_fetch(fetch, heights):
     for wind, height in zip((3, 6, 10), heights, strict=True):
         spectrum = ElfouhailySpectrum(wind, inverse_wave_age(wind, fetch))
@@ -220,7 +217,7 @@ def test_swell_variance_is_conserved_in_a_short_period():
     assert index[i] * index[j] > 0
 
 
-@each_row("kind", SPECTRA)
+@each_row(*zip(SPECTRA))
 def test_directional_spectrum_integrates_to_elevation_and_slopes(kind):
     """A direction counted clockwise, or along taken for across, changes the slopes by a fifth and more."""
     spectrum = SPECTRA[kind]
@@ -254,7 +251,7 @@ def test_directional_spectrum_integrates_to_elevation_and_slopes(kind):
     assert there.any()
 
 
-@each_row("kind", ["elfouhaily", "pierson_moskowitz", "jonswap", "matched", "swell"])
+@each_row("elfouhaily", "pierson_moskowitz", "jonswap", "matched", "swell")
 def test_mode_variances_are_the_directional_spectrum(kind):
     """For these as fast as each |k| is looked up once; a mirrored or turned lookup would show."""
     spectrum = SPECTRA[kind]
@@ -276,8 +273,8 @@ def test_sea_is_the_sum_of_its_components_along_the_axes_of_the_first():
     assert SeaState((wind, SwellSpectrum(0.1, 50))).peak_wavenumber == wind.peak_wavenumber
 
 
-@each_row("wind", [1, 3, 6, 10, 15, 30])
-@each_row("kind", [ElfouhailySpectrum, PiersonMoskowitzSpectrum, JonswapSpectrum])
+@each_row(1, 3, 6, 10, 15, 30)
+@each_row(ElfouhailySpectrum, PiersonMoskowitzSpectrum, JonswapSpectrum)
 def test_matched_totals(kind, wind):
     options = {"fetch": 3000 * wind**2 / G} if kind is JonswapSpectrum else {}
     plain = kind(wind, direction=0.8, **options)
@@ -306,11 +303,8 @@ def test_matched_totals(kind, wind):
 
 
 @each_row(
-    ("plain", "upwind", "crosswind"),
-    [
-        (ElfouhailySpectrum(6), 0.0010, 0.0005),  # less than the waves longer than 1 m have
-        (PiersonMoskowitzSpectrum(6), 0.004, 0.011),
-    ],
+    (ElfouhailySpectrum(6), 0.0010, 0.0005),  # less than the waves longer than 1 m have
+    (PiersonMoskowitzSpectrum(6), 0.004, 0.011),
 )
 def test_matched_totals_far_from_the_spectrum(plain, upwind, crosswind):
     matched = MatchedSpectrum(plain, upwind, crosswind)

@@ -88,9 +88,9 @@ def test_clear_water_needs_the_floors():
     assert deviations(profile, 0.01).max() <= 1 + 1e-6
 
 
-@each_row("nodes", [2, 50, 1000])
-@each_row("order", [1, -1])
-def test_fewest_layers_of_a_straight_profile(nodes, order):
+@each_row(2, 50, 1000)
+@each_row(1, -1)
+def test_fewest_layers_of_a_straight_profile(order, nodes):
     """A layer may span a ratio of 1 + 2 tolerance; collinear nodes change nothing. The last layer has no end."""
     z = np.linspace(0, 10, nodes)
     b = np.linspace(0.1, 0.8, nodes)[::order]
@@ -104,8 +104,8 @@ def test_a_steep_profile_has_layers_of_finite_thickness():
     assert water.cumulative(5.0) == pytest.approx(0.9 * 3 + 0.5 * 2, rel=1e-6)
 
 
-@each_row("names", ["ab", "ac", "bc", "a,omega", "b,omega", "c,omega", "abc", "ab,omega", "bc,omega", "abc,omega"])
-def test_every_pair_gives_the_same_water(tmp_path, names):
+@each_row("ab", "ac", "bc", "a,omega", "b,omega", "c,omega", "abc", "ab,omega", "bc,omega", "abc,omega")
+def test_every_pair_gives_the_same_water(names, tmp_path):
     letters, _, omega = names.partition(",")
     chosen = [*letters, omega] if omega else list(letters)
     given = {"depth": DEPTH, **{name: WATER[name] for name in chosen}, "bb": BB}
@@ -140,17 +140,14 @@ def test_csv_and_netcdf_give_the_same_layers(tmp_path, profile):
 
 
 @each_row(
-    "text",
-    [
-        "z,a,b,bb\n0,0.1,0.2,0.01\n-1.5,0.2,0.4,0.02\n-4,0.1,0.2,0.01\n",
-        "Station 7\n\nbb532;depth_m;c(532) 1/m;T;a532\n0,01;4;0,3;12,5;0,1\n0,02;1,5;0,6;12;0,2\n0,01;0;0,3;12;0,1\n",
-        "\ufeffDepth [cm]\tb\ta\tbb/b\r\n0\t0.2\t0.1\t0.05\r\n150\t0.4\t0.2\t0.05\r\n400\t0.2\t0.1\t0.05\r\n",
-        "# probe 3\ndepth a     b bb\nm  1/m   1/m   1/m\n0 0.1 0.2 0.01\n1.5 0.2 0.4 0.02\n4 0.1 0.2 0.01\n",
-        "depth,omega,c,bb\n0,0.666666666666666667,0.3,0.01\n1.5,0.666666666666666667,0.6,0.02\n2,-9999,1,1\n4,0.666666666666666667,.3,.01",
-        "depth,a,b,bb\n4,0.1,0.2,0.01\n1.5,0.1,0.3,0.01\n1.5,0.3,0.5,0.03\n0,0.1,0.2,0.01\n1,nan,1,1\n",
-    ],
+    "z,a,b,bb\n0,0.1,0.2,0.01\n-1.5,0.2,0.4,0.02\n-4,0.1,0.2,0.01\n",
+    "Station 7\n\nbb532;depth_m;c(532) 1/m;T;a532\n0,01;4;0,3;12,5;0,1\n0,02;1,5;0,6;12;0,2\n0,01;0;0,3;12;0,1\n",
+    "\ufeffDepth [cm]\tb\ta\tbb/b\r\n0\t0.2\t0.1\t0.05\r\n150\t0.4\t0.2\t0.05\r\n400\t0.2\t0.1\t0.05\r\n",
+    "# probe 3\ndepth a     b bb\nm  1/m   1/m   1/m\n0 0.1 0.2 0.01\n1.5 0.2 0.4 0.02\n4 0.1 0.2 0.01\n",
+    "depth,omega,c,bb\n0,0.666666666666666667,0.3,0.01\n1.5,0.666666666666666667,0.6,0.02\n2,-9999,1,1\n4,0.666666666666666667,.3,.01",
+    "depth,a,b,bb\n4,0.1,0.2,0.01\n1.5,0.1,0.3,0.01\n1.5,0.3,0.5,0.03\n0,0.1,0.2,0.01\n1,nan,1,1\n",
 )
-def test_the_same_profile_in_any_form(tmp_path, text):
+def test_the_same_profile_in_any_form(text, tmp_path):
     path = tmp_path / "water.txt"
     path.write_bytes(text.encode())
     read = read_profile(path)

@@ -21,9 +21,9 @@ def test_indices_are_quan_and_fry_relative_to_air():
     assert refractive_index(589.3, 20, 0) == pytest.approx(1.33299, abs=5e-5)
 
 
-@each_row("wavelength", [410, 532, 690, 710, 1064])
-@each_row(("temperature", "salinity"), [(0, 0), (5, 38), (30, 7)])
-def test_group_index_is_the_derivative_of_the_index(wavelength, temperature, salinity):
+@each_row(410, 532, 690, 710, 1064)
+@each_row((0, 0), (5, 38), (30, 7))
+def test_group_index_is_the_derivative_of_the_index(temperature, salinity, wavelength):
     step = 0.01
     up, down = (refractive_index(wavelength + s, temperature, salinity) for s in (step, -step))
     expected = refractive_index(wavelength, temperature, salinity) - wavelength * (up - down) / (2 * step)
@@ -36,7 +36,7 @@ def test_absorption_is_pope_and_fry():
     assert water_absorption(532) == pytest.approx(0.04444, abs=1e-8)
 
 
-@each_row(("wavelength", "extinction", "tolerance"), [(1064, 1.21925e-6, 0.005), (1000, 3.19106e-6, 0.02)])
+@each_row((1064, 1.21925e-6, 0.005), (1000, 3.19106e-6, 0.02))
 def test_near_infrared_agrees_with_kedenburg(wavelength, extinction, tolerance):
     """Absorption 4 pi k / wavelength, and index of water at 20 degrees C, by Kedenburg et al. 2012 (other cells)."""
     assert water_absorption(wavelength) == pytest.approx(4e9 * np.pi * extinction / wavelength, rel=tolerance)
@@ -78,7 +78,7 @@ def test_depolarisation_raises_scattering_by_the_cabannes_factor():
     assert ratio == pytest.approx((6 * 2.09) / (6 - 0.63) / 2, rel=1e-12)
 
 
-@each_row("depolarisation", [0.0, 0.039, 0.09])
+@each_row(0.0, 0.039, 0.09)
 def test_phase_function_is_normalised_and_symmetric(depolarisation):
     nodes, weights = np.polynomial.legendre.leggauss(4)
     values = water_phase_function(np.arccos(nodes), depolarisation)
