@@ -54,11 +54,11 @@ def each_row(*rows):
 
 
 def each_case(*rows):
-    """Return a decorator as `each_row`, which makes a test of each row: for what takes long or needs its own fixtures."""
+    """Return a decorator as `each_row`, which makes a test of each row: for what takes long or has other fixtures."""
 
     def decorate(test):
         names = names_of(test, rows)
-        single = [row[0] if isinstance(row, tuple) else row for row in rows]
+        single = [row[0] if isinstance(row, tuple) and not hasattr(row, "marks") else row for row in rows]
         return pytest.mark.parametrize(",".join(names), rows if len(names) > 1 else single)(test)
 
     return decorate

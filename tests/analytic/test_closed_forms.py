@@ -14,6 +14,7 @@ from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, s
 from oracles.echo_times import bottom_time_ns
 from oracles.lidar_equation import bottom_energy, column_energy, cos_water, surface_energy
 from oracles.phase import henyey_greenstein
+from rows import each_case
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.level_sea import LidarSystem, surface_time_ns
@@ -204,14 +205,11 @@ def test_water_in_the_near_infrared(lidar_scene, passes, integrator):
     significance.assert_equal(found, expected[1:9], error=0.03, bias=0.01)
 
 
-@pytest.mark.parametrize(
-    ("wind", "angle", "wind_from_deg"),
-    [
-        *((6.0, *place) for place in ((20.0, 0.0), (20.0, 180.0), (12.0, 120.0))),
-        *((10.0, 30.0, wind_from_deg) for wind_from_deg in (0.0, 180.0)),
-    ],
+@each_case(
+    *((6.0, *place) for place in ((20.0, 0.0), (20.0, 180.0), (12.0, 120.0))),
+    *((10.0, 30.0, wind_from_deg) for wind_from_deg in (0.0, 180.0)),
 )
-def test_surface_of_measured_slopes(lidar_scene, passes, wind, angle, wind_from_deg):
+def test_surface_of_measured_slopes(wind, angle, wind_from_deg, lidar_scene, passes):
     """Cox and Munk's series at 6 m/s, looking upwind, downwind and aside: 1.19, 0.74 and 0.93 times the Gaussian.
 
     At 30 degrees and 10 m/s, 3.9 standard deviations of the slopes, 2.31 upwind and 0.19 times downwind.

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.gates import transmission
-from rows import refuses
+from rows import each_case, refuses
 from scipy.ndimage import gaussian_filter
 from significance import largest_z
 
@@ -73,12 +73,8 @@ def test_recut_gates_are_those_of_the_render(lidar_scene):
         assert 0.7 < float(ratio.median()) < 1.4, name
 
 
-@pytest.mark.parametrize(
-    "integrator",
-    # Both give their light to the same histogram.
-    [pytest.param("lidar_merging", marks=pytest.mark.long), pytest.param("lidar_volpath", marks=pytest.mark.slow)],
-)
-def test_short_memory_gives_the_same_gates(lidar_scene, integrator, caplog):
+@each_case(pytest.param("lidar_merging", marks=pytest.mark.long), pytest.param("lidar_volpath", marks=pytest.mark.slow))
+def test_short_memory_gives_the_same_gates(integrator, lidar_scene, caplog):
     """The same paths: cut from each pass in 32 bits, or summed where they arrive, exact to the bin's width."""
     pulses = {"pulses": 10}
     whole = render(gated(lidar_scene, integrator, pulses))
@@ -168,16 +164,13 @@ def test_gates_that_cannot_be(film, gigabytes, lidar_scene):
     render(gated(lidar_scene, film=film), gigabytes, passes=2)
 
 
-@pytest.mark.parametrize(
-    ("film", "words"),
-    [
-        ({"gate_width_ns": 0.0}, "gate_width_ns = 0"),
-        ({"gate_step_ns": -1.0}, "gate_step_ns = -1"),
-        ({"gate_count": -1}, "gate_count = -1"),
-        ({"gate_start_depth": 3.0}, "and gate_start_depth = 3.0 describe the same"),
-        ({"pulses": 0}, "pulses = 0"),
-        ({"gate_profile": "missing.txt"}, "gate_width_ns = 8.0 and gate_profile = 'missing.txt' describe the same"),
-    ],
+@each_case(
+    ({"gate_width_ns": 0.0}, "gate_width_ns = 0"),
+    ({"gate_step_ns": -1.0}, "gate_step_ns = -1"),
+    ({"gate_count": -1}, "gate_count = -1"),
+    ({"gate_start_depth": 3.0}, "and gate_start_depth = 3.0 describe the same"),
+    ({"pulses": 0}, "pulses = 0"),
+    ({"gate_profile": "missing.txt"}, "gate_width_ns = 8.0 and gate_profile = 'missing.txt' describe the same"),
 )
 def test_parameters_of_gates_out_of_range(film, words):
     with pytest.raises(Exception, match=words):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import significance
 import xarray as xr
+from rows import each_case
 from scipy.stats import f as f_distribution
 
 import mitransient_lidar
@@ -107,16 +108,13 @@ def test_series_by_maps_are_rendered_again():
     xr.testing.assert_identical(mitransient_lidar.render(series)["waveform"], series["waveform"])
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"light": "paths"}, "light = 'paths' must be one of merging, maps"),
-        ({"light": "maps", "derivatives": "attenuation"}, "light = 'maps' has no derivatives"),
-        (
-            {"light": "maps", "params": {"off_nadir_deg": 60}},
-            "maps do not suit the scene: the receiver looks more than 45 degrees from nadir; use light = 'merging'",
-        ),
-    ],
+@each_case(
+    ({"light": "paths"}, "light = 'paths' must be one of merging, maps"),
+    ({"light": "maps", "derivatives": "attenuation"}, "light = 'maps' has no derivatives"),
+    (
+        {"light": "maps", "params": {"off_nadir_deg": 60}},
+        "maps do not suit the scene: the receiver looks more than 45 degrees from nadir; use light = 'merging'",
+    ),
 )
 def test_what_maps_are_not_for(options, message):
     for render, more in ((mitransient_lidar.render, {}), (mitransient_lidar.render_shots, {"positions": [[0, 0]]})):

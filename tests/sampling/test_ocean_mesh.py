@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from kernel_arrays import array, vector
+from rows import each_case
 from significance import assert_equal, assert_same
 
 from mitransient_lidar.loading.scenes import open_scene
@@ -109,10 +110,7 @@ def test_facet_slopes_have_the_stated_variance_along_and_across_the_wind():
     assert_equal(ratios, [1, 1], error=0.012)
 
 
-@pytest.mark.parametrize(
-    ("asked", "total"),
-    [("cox_munk", sum(cox_munk(6.0))), ("spectrum", sum(ElfouhailySpectrum(6.0).slope_variance())), ("0.1", 0.1)],
-)
+@each_case(("cox_munk", sum(cox_munk(6.0))), ("spectrum", sum(ElfouhailySpectrum(6.0).slope_variance())), ("0.1", 0.1))
 def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, total):
     _, shape = surface(wind_speed=6.0, slope_variance=asked, **PATCH)
     assert shape.sea.slope_variance == pytest.approx(total, rel=1e-9)

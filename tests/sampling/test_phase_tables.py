@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
-from rows import each_row
+from rows import each_case, each_row
 from significance import largest_z
 
 from mitransient_lidar.transport.medium import tabulated_phase
@@ -68,10 +68,7 @@ def test_fournier_forand_family(ratio):
     assert plugin.tabulated.table.backscatter_ratio == pytest.approx(ratio, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("index", "slope", "ratio"),
-    [(1.040, 3.2010, 1.003e-3), (1.08, 3.483, 1.0037e-2), (1.175, 4.065, 0.10008), (1.15, 4.874, 0.40052)],
-)
+@each_case((1.040, 3.2010, 1.003e-3), (1.08, 3.483, 1.0037e-2), (1.175, 4.065, 0.10008), (1.15, 4.874, 0.40052))
 def test_fournier_forand_by_index_and_slope(index, slope, ratio):
     """Pairs that the Ocean Optics Web Book lists with their backscatter ratios."""
     plugin = mi.load_dict({"type": "fournier_forand", "refractive_index": index, "junge_slope": slope})
@@ -99,14 +96,11 @@ def test_petzold_at_every_tabulated_angle():
     assert core == pytest.approx(0.05169 / 0.9929, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    "description",
-    [
-        {"type": "fournier_forand", "backscatter_ratio": 0.005},
-        {"type": "fournier_forand", "backscatter_ratio": 0.0183},
-        {"type": "petzold", "water": "clear"},
-        {"type": "sea_water"},
-    ],
+@each_case(
+    {"type": "fournier_forand", "backscatter_ratio": 0.005},
+    {"type": "fournier_forand", "backscatter_ratio": 0.0183},
+    {"type": "petzold", "water": "clear"},
+    {"type": "sea_water"},
 )
 def test_short_segments_are_sampled_as_the_power_laws_they_are(description, monkeypatch):
     """The series against logarithm and exponential, whose own rounding grows where an exponent is close to 1."""

@@ -17,6 +17,7 @@ import psutil
 import pytest
 from command_line import assert_refused, run
 from quick_campaign import files_of, planned_copy
+from rows import each_case
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.campaigns import shard as shards
@@ -172,14 +173,11 @@ def test_a_process_that_hangs(quick, tmp_path, monkeypatch):
     assert files_of(path) == files_of(quick)
 
 
-@pytest.mark.parametrize(
-    ("state", "error", "hangs"),
-    [
-        (psutil.STATUS_STOPPED, None, True),
-        (psutil.STATUS_DISK_SLEEP, None, False),
-        (None, psutil.NoSuchProcess(1), False),
-        (None, psutil.AccessDenied(1), False),
-    ],
+@each_case(
+    (psutil.STATUS_STOPPED, None, True),
+    (psutil.STATUS_DISK_SLEEP, None, False),
+    (None, psutil.NoSuchProcess(1), False),
+    (None, psutil.AccessDenied(1), False),
 )
 def test_a_process_hangs_that_neither_computes_nor_waits_for_a_disk(state, error, hangs, monkeypatch, caplog):
     looks, enough = [], threading.Event()

@@ -8,6 +8,7 @@ import pytest
 import significance
 from command_line import assert_refused, run
 from oracles import las_reader
+from rows import each_case
 from significance import largest_z
 
 from mitransient_lidar.campaigns.store import DONE, FAILED, Store
@@ -202,23 +203,20 @@ def assert_files(folder, points, flown):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"parameters": {**FLIGHT["parameters"], "bottom_size": 60}}, "the bottom does not cover the flight"),
-        ({"parameters": {"bottom_dept": 3}}, "parameter 'bottom_dept' is not one of scene flight"),
-        ({"instrument": None, "parameters": {"layout": "8x8"}}, "has an imager"),
-        ({"instrument": "published_mast", "corrections": "auto"}, "no shipped corrections of the instrument"),
-        (
-            {"instrument": "riegl_vq880g2", "infrared": True, "corrections": "auto"},
-            "corrections are of surfaces from green light",
-        ),
-        ({"infrared": True}, "instrument = 'published_airborne' has no infrared channel; instruments with one are"),
-        (
-            {"parameters": {**FLIGHT["parameters"], "time_start_ns": 1380, "bin_count": 60}},
-            "no bottom within the record",
-        ),
-    ],
+@each_case(
+    ({"parameters": {**FLIGHT["parameters"], "bottom_size": 60}}, "the bottom does not cover the flight"),
+    ({"parameters": {"bottom_dept": 3}}, "parameter 'bottom_dept' is not one of scene flight"),
+    ({"instrument": None, "parameters": {"layout": "8x8"}}, "has an imager"),
+    ({"instrument": "published_mast", "corrections": "auto"}, "no shipped corrections of the instrument"),
+    (
+        {"instrument": "riegl_vq880g2", "infrared": True, "corrections": "auto"},
+        "corrections are of surfaces from green light",
+    ),
+    ({"infrared": True}, "instrument = 'published_airborne' has no infrared channel; instruments with one are"),
+    (
+        {"parameters": {**FLIGHT["parameters"], "time_start_ns": 1380, "bin_count": 60}},
+        "no bottom within the record",
+    ),
 )
 def test_flights_that_cannot_be_rendered(change, message):
     with pytest.raises(Exception, match=message):

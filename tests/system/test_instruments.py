@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from command_line import assert_refused, run
-from rows import each_row
+from rows import each_case, each_row
 from significance import variance_limits
 
 import mitransient_lidar
@@ -42,12 +42,13 @@ OWN = {"published_airborne": "table1", "published_mast": "fig04_mast"}
 KINDS = ("published_mast", "icesat2_atlas", "riegl_vq840g", "teledyne_czmil", "riegl_vq880g2_infrared")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow if name in KINDS else pytest.mark.long)
-        for name in catalogue.instrument_names()
-    ],
+@each_case(
+    *zip(
+        [
+            pytest.param(name, marks=pytest.mark.slow if name in KINDS else pytest.mark.long)
+            for name in catalogue.instrument_names()
+        ]
+    ),
 )
 def test_every_instrument_renders(name):
     """Surface and bottom return light at their times, in every channel; a scene's own lidar gives the same bits."""

@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from rows import each_case
 
 import mitransient_lidar
 
@@ -98,13 +99,10 @@ app.main()
 """
 
 
-@pytest.mark.parametrize(
-    ("number", "code"),
-    [
-        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
-        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.long),
-        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.long),
-    ],
+@each_case(
+    pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
+    pytest.param(signal.SIGTERM, 143, marks=pytest.mark.long),
+    pytest.param(signal.SIGHUP, 129, marks=pytest.mark.long),
 )
 def test_a_signal_after_the_last_file_ends_as_any_other(number, code):
     process = start(LATE, int(number), "scenes", "list", stdout=subprocess.PIPE, stderr=subprocess.PIPE)

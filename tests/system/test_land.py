@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_case, each_row
 from significance import largest_z, mean_and_error
 
 import mitransient_lidar
@@ -72,16 +72,13 @@ def test_dry_land_has_its_closed_form(integrator, height, shore):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("aim", "land", "cell"),
-    [
-        pytest.param(-4.0, 0.0, 0, marks=pytest.mark.long),
-        (-1.0, 0.17, 0),
-        *(pytest.param(0.0, 0.5, cell, marks=pytest.mark.long) for cell in (0, 0.2)),
-        (2.0, 0.97, 0),
-    ],
+@each_case(
+    pytest.param(-4.0, 0.0, 0, marks=pytest.mark.long),
+    (-1.0, 0.17, 0),
+    *(pytest.param(0.0, 0.5, cell, marks=pytest.mark.long) for cell in (0, 0.2)),
+    (2.0, 0.97, 0),
 )
-def test_footprints_with_more_and_less_land_agree(shore, aim, land, cell):
+def test_footprints_with_more_and_less_land_agree(aim, land, cell, shore):
     """Light was merged beyond the water line, too: wide patches lost 2 % of the bottom, and a thin wedge 5 % of it."""
     path, params = shore(), {"aim_x": aim, "spectrum": "flat"}
     merging = {"type": "lidar_merging", "cell_size": cell} if cell else "lidar_merging"

@@ -7,6 +7,7 @@ import time
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_case
 from scipy.stats import t
 from significance import largest_z
 
@@ -175,14 +176,11 @@ def test_error_window_leaves_out_dark_pixels_and_counts_empty_bins_as_infinite()
     assert errors.tolist() == [1, 0.5, 0.25, 1, np.inf, 1]
 
 
-@pytest.mark.parametrize(
-    ("integrator", "count"),
-    [
-        pytest.param("lidar_volpath", 24, marks=pytest.mark.slow),
-        pytest.param("lidar_merging", 16, marks=pytest.mark.long),
-    ],
+@each_case(
+    pytest.param("lidar_volpath", 24, marks=pytest.mark.slow),
+    pytest.param("lidar_merging", 16, marks=pytest.mark.long),
 )
-def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(lidar_scene, integrator, count):
+def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(integrator, count, lidar_scene):
     """Same seeds, same flat sea: what the small patch receives less is what it must report, to 25 %, in most passes."""
     engine = {"type": integrator, "paths_per_pass": 2**14}
     if integrator == "lidar_merging":

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_case
 from significance import assert_same
 
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
@@ -162,10 +163,7 @@ def test_heights_of_shots_are_those_at_their_places(depth, slope):
         np.testing.assert_allclose(found.bed_at(mi.Float(x), mi.Float(y)), bed.p.z, atol=0.01)
 
 
-@pytest.mark.parametrize(
-    "integrator",
-    [pytest.param("lidar_merging", marks=pytest.mark.slow), pytest.param("lidar_volpath", marks=pytest.mark.long)],
-)
+@each_case(pytest.param("lidar_merging", marks=pytest.mark.slow), pytest.param("lidar_volpath", marks=pytest.mark.long))
 def test_a_level_scene_is_the_same_everywhere(integrator):
     """On common random numbers: rays left surfaces 9e-5 of their distance from the world's origin too far away."""
     energies = []

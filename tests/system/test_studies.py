@@ -6,6 +6,7 @@ import pytest
 import xarray as xr
 from command_line import assert_refused, run
 from few_paths import few_paths
+from rows import each_case
 
 NEAR = ["-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=85"]
 
@@ -53,14 +54,11 @@ def test_signal_without_a_receiver(scene, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "heads", "drawn"),
-    [
-        (["--depths", "2,5"], ["2", "5"], "distance from the centroid (m)"),
-        (["--fov-mrad", "20,35", "--passes", 8], ["20", "35"], "field of view (mrad)"),
-    ],
+@each_case(
+    (["--depths", "2,5"], ["2", "5"], "distance from the centroid (m)"),
+    (["--fov-mrad", "20,35", "--passes", 8], ["20", "35"], "field of view (mrad)"),
 )
-def test_other_scattering(scene, tmp_path, words, heads, drawn):
+def test_other_scattering(words, heads, drawn, scene, tmp_path):
     plot = tmp_path / "light.svg"
     done = run("scattering", scene, *NEAR, *words, "-o", plot, "-q")
     assert done.exit_code == 0, done.stderr

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from rows import each_case
 from significance import variance_limits
 
 from mitransient_lidar.rendering.accuracy import ErrorCorrelation, PassStatistics
@@ -38,13 +39,10 @@ def variance_ratios(results, windows):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "params",
-    [
-        pytest.param({}, id="default"),
-        pytest.param({"jerlov": "5C", "off_nadir_deg": "0", "bottom_depth": "5"}, id="turbid"),
-        pytest.param({"bottom_depth": "12", "attenuation": "0.1", "scattering": "0.06"}, id="clear"),
-    ],
+@each_case(
+    pytest.param({}, id="default"),
+    pytest.param({"jerlov": "5C", "off_nadir_deg": "0", "bottom_depth": "5"}, id="turbid"),
+    pytest.param({"bottom_depth": "12", "attenuation": "0.1", "scattering": "0.06"}, id="clear"),
 )
 def test_stated_errors_of_sums_are_those_of_forty_renders(params):
     """Windows of 3 to 7 m between surface and bottom."""

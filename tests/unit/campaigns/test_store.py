@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from rows import each_row
+from rows import each_case, each_row
 
 from mitransient_lidar.campaigns import sweep
 from mitransient_lidar.campaigns.design import Campaign
@@ -163,11 +163,10 @@ def flip(path):
 CHUNKS = ["waveform/c/1/0/0/0", "echo_flags/c/1/0/0", "error/c/1", "status/c/1", "surface_seed/c/1"]
 
 
-@pytest.mark.parametrize(
-    ("chunk", "damage"),
-    [*((chunk, flip) for chunk in CHUNKS), (CHUNKS[0], Path.unlink), (CHUNKS[1], lambda path: path.write_bytes(b""))],
+@each_case(
+    *((chunk, flip) for chunk in CHUNKS), (CHUNKS[0], Path.unlink), (CHUNKS[1], lambda path: path.write_bytes(b""))
 )
-def test_damaged_shards_are_planned_again(full, path, caplog, chunk, damage):
+def test_damaged_shards_are_planned_again(chunk, damage, full, path, caplog):
     damage(path / chunk)
     store = Store(path)
     store.mend()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from figure_inputs import result
 from PIL import Image
+from rows import each_case
 
 from mitransient_lidar import results
 
@@ -61,16 +62,13 @@ def test_all_kinds_of_files_in_a_new_folder(stored, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "part"),
-    [
-        ((), "one start"),
-        (("--start-ns", 1410), "one shape"),
-        (("--start-ns", 1406, "--width-ns", 5), "gate train before the surface"),
-        (("--start-ns", 1550, "--width-ns", 5, "--count", 3), "within the record"),
-    ],
+@each_case(
+    ((), "one start"),
+    (("--start-ns", 1410), "one shape"),
+    (("--start-ns", 1406, "--width-ns", 5), "gate train before the surface"),
+    (("--start-ns", 1550, "--width-ns", 5, "--count", 3), "within the record"),
 )
-def test_sentences(stored, arguments, part):
+def test_sentences(arguments, part, stored):
     command_line.assert_refused(run(stored[0], *arguments), part)
 
 

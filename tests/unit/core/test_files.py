@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from rows import each_case
 
 from mitransient_lidar.core import files
 from mitransient_lidar.core.errors import UserError
@@ -105,11 +106,8 @@ def test_a_failure_while_files_are_moved_restores_the_former_ones(tmp_path, monk
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("event", "kept"),
-    [("a.txt", {"b.txt": "old"}), ("b.txt", {"b.txt": "old"}), ("moving", {"a.txt": "new", "b.txt": "old"})],
-)
-def test_the_next_run_sweeps_what_a_killed_one_left(tmp_path, event, kept):
+@each_case(("a.txt", {"b.txt": "old"}), ("b.txt", {"b.txt": "old"}), ("moving", {"a.txt": "new", "b.txt": "old"}))
+def test_the_next_run_sweeps_what_a_killed_one_left(event, kept, tmp_path):
     (tmp_path / "b.txt").write_text("old")
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), event], check=False, timeout=60)
     assert killed.returncode == -signal.SIGKILL

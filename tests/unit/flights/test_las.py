@@ -13,7 +13,7 @@ import pyproj
 import pytest
 import xarray as xr
 from oracles import las_reader
-from rows import each_row
+from rows import each_case, each_row
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError, WriteError
@@ -117,18 +117,13 @@ def test_read_from_the_specification(
         np.testing.assert_array_equal(read_column(file, name).astype(np.float32), points[name].astype(np.float32))
 
 
-@pytest.mark.parametrize(
-    ("system", "less", "bit", "text"),
-    [
-        ("flight", 0, 0, "as in the trajectory of the flight, not of a known GPS week"),
-        ("gps_week", 0, 0, "seconds of the GPS week"),
-        ("adjusted_gps", 0, 1, "adjusted standard GPS time"),
-        ("gps", 1e9, 1, "adjusted standard GPS time"),
-    ],
+@each_case(
+    ("flight", 0, 0, "as in the trajectory of the flight, not of a known GPS week"),
+    ("gps_week", 0, 0, "seconds of the GPS week"),
+    ("adjusted_gps", 0, 1, "adjusted standard GPS time"),
+    ("gps", 1e9, 1, "adjusted standard GPS time"),
 )
-def test_times_their_type_and_the_notes_agree(
-    tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset, system: str, less: float, bit: int, text: str
-) -> None:
+def test_times_their_type_and_the_notes_agree(system, less, bit, text, tmp_path, points, waveforms):
     """Adjusted standard GPS time is GPS time less 10^9 s (LAS 1.4 R15, table 4, bit 0 of the global encoding)."""
     points["gps_time"] = points["gps_time"] + less + 1000
     points["gps_time"].attrs["time_system"] = system
@@ -323,31 +318,26 @@ def test_samples_lie_on_the_refracted_ray(tmp_path: Path, points: xr.Dataset, wa
 # Wrong input
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("x", np.nan, "x holds nan"),
-        ("z", np.inf, "z holds inf"),
-        ("y", 1e10, "y = 1e+10 m must be within 2147 km of 6.5e+06 m"),
-        ("gps_time", np.nan, "gps_time holds nan"),
-        ("return_number", 3, "return_number = 3 must be at most number_of_returns, 2"),
-        ("number_of_returns", 16, "number_of_returns = 16 must lie between 1 and 15"),
-        ("return_number", 0, "return_number = 0 must lie between 1 and 15"),
-        ("kind", 256, "kind = 256 must lie between 0 and 255"),
-        ("scan_angle_deg", -181, "scan_angle_deg = -181 must lie between -180 and 180"),
-        ("pixel", 65536, "pixel = 65536 must lie between 0 and 65535"),
-        ("quality", 256, "quality = 256 must lie between 0 and 255"),
-        ("channel", 4, "channel = 4 must lie between 0 and 3"),
-        ("shot", -1, "shot = -1 must lie between 0 and 4294967295"),
-        ("line", 70000, "line = 70000 must lie between 0 and 65535"),
-        ("packet", 240, "packet = 240 must lie between -1, for none, and 239, the last packet"),
-        ("time_in_packet_ns", np.nan, "time_in_packet_ns holds nan"),
-        ("direction", 0.5, "direction has the length"),
-    ],
+@each_case(
+    ("x", np.nan, "x holds nan"),
+    ("z", np.inf, "z holds inf"),
+    ("y", 1e10, "y = 1e+10 m must be within 2147 km of 6.5e+06 m"),
+    ("gps_time", np.nan, "gps_time holds nan"),
+    ("return_number", 3, "return_number = 3 must be at most number_of_returns, 2"),
+    ("number_of_returns", 16, "number_of_returns = 16 must lie between 1 and 15"),
+    ("return_number", 0, "return_number = 0 must lie between 1 and 15"),
+    ("kind", 256, "kind = 256 must lie between 0 and 255"),
+    ("scan_angle_deg", -181, "scan_angle_deg = -181 must lie between -180 and 180"),
+    ("pixel", 65536, "pixel = 65536 must lie between 0 and 65535"),
+    ("quality", 256, "quality = 256 must lie between 0 and 255"),
+    ("channel", 4, "channel = 4 must lie between 0 and 3"),
+    ("shot", -1, "shot = -1 must lie between 0 and 4294967295"),
+    ("line", 70000, "line = 70000 must lie between 0 and 65535"),
+    ("packet", 240, "packet = 240 must lie between -1, for none, and 239, the last packet"),
+    ("time_in_packet_ns", np.nan, "time_in_packet_ns holds nan"),
+    ("direction", 0.5, "direction has the length"),
 )
-def test_wrong_points(
-    tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset, name: str, value: float, message: str
-) -> None:
+def test_wrong_points(name, value, message, tmp_path, points, waveforms):
     path = tmp_path / "waveforms.las"
     path.write_text("former")
     points[name].values[7] = value

@@ -1,7 +1,7 @@
 import numpy as np
 import pyproj
 import pytest
-from rows import each_row, refuses
+from rows import each_case, each_row, refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.platforms import platform_of
@@ -173,12 +173,8 @@ def test_invalid_coordinate_systems(epsg, tmp_path):
     read_sbet_records(tmp_path / "flight.sbet", epsg)
 
 
-@pytest.mark.parametrize(
-    ("longitude", "latitude", "epsg", "scale"),
-    # Spherical Mercator, 1 / cos(60 deg) but for the ellipsoid; the antipode of Lambert's projection.
-    [(15.0, 60.0, 3857, "2"), (-170.0, -52.0, 3035, "nan")],
-)
-def test_sbet_where_the_projection_has_another_scale(tmp_path, longitude, latitude, epsg, scale):
+@each_case((15.0, 60.0, 3857, "2"), (-170.0, -52.0, 3035, "nan"))
+def test_sbet_where_the_projection_has_another_scale(longitude, latitude, epsg, scale, tmp_path):
     _sbet(tmp_path / "flight.sbet", np.full(3, longitude), np.full(3, latitude))
     message = (
         rf"record 1: latitude = {latitude:g} and longitude = {longitude:g} deg must .*; its scale there is {scale}"

@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_case
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue, scenes
@@ -146,17 +147,14 @@ def test_part_beside_the_including_file_is_found(scene):
     assert read_document(scene).text == FLAT
 
 
-@pytest.mark.parametrize(
-    ("part", "text", "sentence"),
-    [
-        ("own.xml", '<scene><include filename="gone.xml"/></scene>', r"own\.xml includes 'gone\.xml', which is not"),
-        ("own.xml", "<scene><include/></scene>", "own.xml includes '', which is not found"),
-        ("parts/matt.xml", '<bsdf><include filename="ball.xml"/>', r"scene .*matt\.xml is not well-formed XML"),
-        ("parts/point.xml", '<scene><include filename="ball.xml"/></scene>', r"includes 'ball\.xml', which includes"),
-        ("parts/point.xml", b"\xff\xfe\x00", r"point\.xml is not a text file in UTF-8"),
-    ],
+@each_case(
+    ("own.xml", '<scene><include filename="gone.xml"/></scene>', r"own\.xml includes 'gone\.xml', which is not"),
+    ("own.xml", "<scene><include/></scene>", "own.xml includes '', which is not found"),
+    ("parts/matt.xml", '<bsdf><include filename="ball.xml"/>', r"scene .*matt\.xml is not well-formed XML"),
+    ("parts/point.xml", '<scene><include filename="ball.xml"/></scene>', r"includes 'ball\.xml', which includes"),
+    ("parts/point.xml", b"\xff\xfe\x00", r"point\.xml is not a text file in UTF-8"),
 )
-def test_wrong_includes(scene, part, text, sentence):
+def test_wrong_includes(part, text, sentence, scene):
     (scene.parent / part).write_bytes(text if isinstance(text, bytes) else text.encode())
     for use in (read_document, catalogue.scene_parameters, catalogue.copy_scene, scenes.open_scene):
         with pytest.raises(UserError, match=sentence):

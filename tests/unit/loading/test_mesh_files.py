@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from array_inputs import mesh
+from rows import each_case
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.checks import check_ply
@@ -54,23 +55,20 @@ def test_the_mesh_of_a_result_is_checked(square):
         open_scene(SceneSource.from_attributes(changed))
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        (b"element vertex 4", b"element vertex 5"),
-        (b"element vertex 4", b"element vertex 4294967300"),
-        (b"element vertex 4", b"element vertex -1"),
-        (b"element face 2", b"element face 1000000000000"),
-        (b"element face 2", b"element face 3"),
-        (b"element face 2", b"element vertex 2"),
-        (b"element face 2", b"element nothing 99999999999999\nelement face 2"),
-        (b"property list uchar int vertex_indices", b"property list uchar none vertex_indices"),
-        (b"end_header", b"end_of_header"),
-        (b"ply\n", b"ply\ncomment " + b"x" * 5000 + b"\n"),
-        (b"element face 2", b"element \x1b]0;title\x07 0\nelement face 2"),
-    ],
+@each_case(
+    (b"element vertex 4", b"element vertex 5"),
+    (b"element vertex 4", b"element vertex 4294967300"),
+    (b"element vertex 4", b"element vertex -1"),
+    (b"element face 2", b"element face 1000000000000"),
+    (b"element face 2", b"element face 3"),
+    (b"element face 2", b"element vertex 2"),
+    (b"element face 2", b"element nothing 99999999999999\nelement face 2"),
+    (b"property list uchar int vertex_indices", b"property list uchar none vertex_indices"),
+    (b"end_header", b"end_of_header"),
+    (b"ply\n", b"ply\ncomment " + b"x" * 5000 + b"\n"),
+    (b"element face 2", b"element \x1b]0;title\x07 0\nelement face 2"),
 )
-def test_headers_that_lie_are_refused(square, old, new):
+def test_headers_that_lie_are_refused(old, new, square):
     change(square, old, new)
     with pytest.raises(UserError, match=r"is damaged, or is not a PLY file of triangles|has a face with the vertex"):
         check_ply(square)

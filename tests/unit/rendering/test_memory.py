@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import xarray as xr
+from rows import each_case
 
 import mitransient_lidar
 from mitransient_lidar.core import validation
@@ -220,13 +221,10 @@ print(found[0], 1.024e-6 * peak)
 """
 
 
-@pytest.mark.parametrize(
-    ("layout", "light", "max_memory"),
-    [
-        pytest.param("256x256", "maps", 0.7, marks=pytest.mark.slow),
-        pytest.param("640x512", "merging", 2, marks=pytest.mark.long),
-        pytest.param("1280x1024", "maps", 1.85, marks=pytest.mark.long),
-    ],
+@each_case(
+    pytest.param("256x256", "maps", 0.7, marks=pytest.mark.slow),
+    pytest.param("640x512", "merging", 2, marks=pytest.mark.long),
+    pytest.param("1280x1024", "maps", 1.85, marks=pytest.mark.long),
 )
 def test_images_take_the_memory_that_is_stated_before_the_render(layout, light, max_memory, tmp_path):
     gates = {"gate_start_ns": 1411, "gate_width_ns": 10, "gate_step_ns": 2.4, "gate_count": 40, "layout": layout}

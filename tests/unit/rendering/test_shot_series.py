@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import run
-from rows import each_row
+from rows import each_case, each_row
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
@@ -259,22 +259,19 @@ def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, t
     assert results.open(tmp_path / "new" / "shots.nc")["aim_y"].values.tolist() == [2.0]
 
 
-@pytest.mark.parametrize(
-    ("scene", "options", "message"),
-    [
-        ("fig09_2x2", {"positions": [(0, 0, 1)]}, r"positions of shape \(1, 3\) must be 1 to 100000 pairs"),
-        ("fig09_2x2", {"positions": []}, r"positions of shape \(0,\) must be 1 to 100000 pairs"),
-        ("fig09_2x2", {"positions": [(0, math.nan)]}, "positions holds nan"),
-        ("fig09_2x2", {"positions": "here"}, "positions = 'here' must hold numbers only"),
-        ("fig09_2x2", {"positions": [(0, -2e7)]}, r"positions = -2e\+07 must lie between"),
-        ("fig09_2x2", {"positions": [(0, 1e5), (0, 1e6)]}, "positions are 900000 m apart along x or y: at most 20000"),
-        ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 2]}, r"shot_passes of shape \(2,\) must be one number"),
-        ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 9, 2]}, "shot_passes = 9 must lie between 2 and 8"),
-        ("fig09_2x2", {"count": 3}, "every shot on a flat sea is the same"),
-        ("fig09_2x2", {"positions": PLACES, "move_target": True}, "has no parameter target_x, which move_target needs"),
-    ],
+@each_case(
+    ("fig09_2x2", {"positions": [(0, 0, 1)]}, r"positions of shape \(1, 3\) must be 1 to 100000 pairs"),
+    ("fig09_2x2", {"positions": []}, r"positions of shape \(0,\) must be 1 to 100000 pairs"),
+    ("fig09_2x2", {"positions": [(0, math.nan)]}, "positions holds nan"),
+    ("fig09_2x2", {"positions": "here"}, "positions = 'here' must hold numbers only"),
+    ("fig09_2x2", {"positions": [(0, -2e7)]}, r"positions = -2e\+07 must lie between"),
+    ("fig09_2x2", {"positions": [(0, 1e5), (0, 1e6)]}, "positions are 900000 m apart along x or y: at most 20000"),
+    ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 2]}, r"shot_passes of shape \(2,\) must be one number"),
+    ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 9, 2]}, "shot_passes = 9 must lie between 2 and 8"),
+    ("fig09_2x2", {"count": 3}, "every shot on a flat sea is the same"),
+    ("fig09_2x2", {"positions": PLACES, "move_target": True}, "has no parameter target_x, which move_target needs"),
 )
-def test_invalid_input_is_refused_before_rendering(rendered, scene, options, message):
+def test_invalid_input_is_refused_before_rendering(scene, options, message, rendered):
     with pytest.raises(UserError, match=message):
         shot_series.render_shots(scene, FLAT, **options)
     assert not rendered

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import rasterio
 import xarray as xr
-from rows import refuses
+from rows import each_case, refuses
 
 from mitransient_lidar.studies import forecast as study
 from mitransient_lidar.studies.forecast import describe_forecast, forecast, write_maps
@@ -94,14 +94,11 @@ def test_a_range_of_depths(tables):
     assert float(at["tvu"]) == pytest.approx(1.96 * np.hypot(0.01 * float(at["depth"]), np.hypot(0.05, up)), rel=0.02)
 
 
-@pytest.mark.parametrize(
-    ("site", "options", "sentence"),
-    [
-        ("2:4", {}, "; the bottom is found down to the deepest place, 4.0 m"),
-        ("9:15", {}, "the bottom is found nowhere in the range of depths"),
-        ("2:4", {"height_m": 0.4}, "no part of the range of depths meets order 1a/1b, and 100 % order 2; "),
-        ("2:4", {"height_m": 2.0}, "no part of the range of depths meets any order; "),
-    ],
+@each_case(
+    ("2:4", {}, "; the bottom is found down to the deepest place, 4.0 m"),
+    ("9:15", {}, "the bottom is found nowhere in the range of depths"),
+    ("2:4", {"height_m": 0.4}, "no part of the range of depths meets order 1a/1b, and 100 % order 2; "),
+    ("2:4", {"height_m": 2.0}, "no part of the range of depths meets any order; "),
 )
 def test_sentences_of_the_extremes(site, options, sentence, tables):
     assert sentence in describe_forecast(forecast("riegl_vq840g", site, secchi=8, **options))[-1]

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from command_line import assert_refused, run
-from rows import each_row
+from rows import each_case, each_row
 from scipy.integrate import trapezoid
 
 from mitransient_lidar.physics.water import water_types
@@ -58,20 +58,17 @@ def test_every_kind_is_printed_and_can_be_rendered(arguments, wanted):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["mud", "3"], "kind = 'mud' must be one of jerlov"),
-        (["jerlov"], "value is missing: jerlov needs one"),
-        (["pure", "3"], "value = '3' must be left out"),
-        (["kd", "clear"], "value = 'clear' must be a number for kd"),
-        (["kd", "0.1", "--wavelength", "500"], "wavelength = 500 must be 532, or 700 to 1100, for kd"),
-        (["petzold", "muddy"], "value = 'muddy' must be one of clear, coastal, turbid, autec_7, "),
-        (["petzold", "clear", "--wavelength", "600"], "wavelength = 600 must lie between 514 and 533, or above"),
-        (["profile", "missing.csv"], "cannot read missing.csv: No such file"),
-        (["jerlov", "II", "-o", "a.txt"], "cannot write a.txt: the file name must end in .png, .pdf or .svg"),
-        (["pure", "-o", "missing/a.png"], "cannot write missing/a.png: No such file"),
-    ],
+@each_case(
+    (["mud", "3"], "kind = 'mud' must be one of jerlov"),
+    (["jerlov"], "value is missing: jerlov needs one"),
+    (["pure", "3"], "value = '3' must be left out"),
+    (["kd", "clear"], "value = 'clear' must be a number for kd"),
+    (["kd", "0.1", "--wavelength", "500"], "wavelength = 500 must be 532, or 700 to 1100, for kd"),
+    (["petzold", "muddy"], "value = 'muddy' must be one of clear, coastal, turbid, autec_7, "),
+    (["petzold", "clear", "--wavelength", "600"], "wavelength = 600 must lie between 514 and 533, or above"),
+    (["profile", "missing.csv"], "cannot read missing.csv: No such file"),
+    (["jerlov", "II", "-o", "a.txt"], "cannot write a.txt: the file name must end in .png, .pdf or .svg"),
+    (["pure", "-o", "missing/a.png"], "cannot write missing/a.png: No such file"),
 )
 def test_mistakes_are_one_sentence(arguments, message):
     assert_refused(run("scenes", "water", *arguments), message)

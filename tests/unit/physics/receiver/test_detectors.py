@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_case, each_row
 from significance import largest_z
 
 from mitransient_lidar.physics.receiver import dead_time
@@ -109,15 +109,12 @@ def varying_light(bins=90, peak=0.8):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "detector",
-    [
-        SinglePhotonDetector(1.0, 7.0),
-        SinglePhotonDetector(1.0, 7.5),
-        SinglePhotonDetector(1.0, 7.2, paralyzable=True),
-        SiliconPhotomultiplier(1.0, 25, 7.3),
-        SiliconPhotomultiplier(1.0, 25, 7.3, crosstalk=0.2, gain=3.0, gain_spread=0.3),
-    ],
+@each_case(
+    SinglePhotonDetector(1.0, 7.0),
+    SinglePhotonDetector(1.0, 7.5),
+    SinglePhotonDetector(1.0, 7.2, paralyzable=True),
+    SiliconPhotomultiplier(1.0, 25, 7.3),
+    SiliconPhotomultiplier(1.0, 25, 7.3, crosstalk=0.2, gain=3.0, gain_spread=0.3),
 )
 def test_geiger_detectors_against_realisations(detector):
     events = varying_light() * getattr(detector, "cells", 1)

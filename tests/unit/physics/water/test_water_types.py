@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import significance
 from oracles.diffuse_attenuation import diffuse_attenuation
-from rows import each_row
+from rows import each_case, each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.seawater import water_absorption
@@ -128,12 +128,13 @@ def generators():
 WATERS = [*(f"jerlov {name}" for name in ("I", "II", "III", "1C", "5C", "9C")), "chlorophyll 1", "kd 0.15", "secchi 6"]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow if "1C" in name or "kd" in name else pytest.mark.long)
-        for name in WATERS
-    ],
+@each_case(
+    *zip(
+        [
+            pytest.param(name, marks=pytest.mark.slow if "1C" in name or "kd" in name else pytest.mark.long)
+            for name in WATERS
+        ]
+    ),
 )
 def test_diffuse_attenuation_by_monte_carlo(name):
     """Kd of each kind of water within the 0.6 % of the fit, in water with the functions that are rendered."""
