@@ -1,8 +1,9 @@
-"""Tables in text files as instruments write them, and line numbers of their errors."""
+"""Tables in text files as instruments write them, line numbers of their errors, and tables that are printed."""
 
 import logging
 
 import numpy as np
+import pandas as pd
 import pytest
 from rows import each_row, refuses
 
@@ -10,6 +11,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables import text_tables
 from mitransient_lidar.core.tables.headings import TIME, Column
 from mitransient_lidar.core.tables.text_tables import read_table, read_time_samples
+from mitransient_lidar.core.tables.written import aligned_lines, table_lines, write_csv
 
 POWER = Column("power", ("p", "v", "mv"))
 TIMES, VALUES = [0.0, 0.5, 2.0], [0.0, 3e-1, 1.0]
@@ -96,3 +98,24 @@ def test_headings_are_looked_for_in_the_first_letters_alone(path, text, monkeypa
     with pytest.raises(UserError, match="has no heading with known columns"):
         read_table(path, (TIME, POWER))
     assert len(asked) <= 2**16
+
+
+def test_cells_stand_below_their_headings():
+    columns = (("name", "<6"), ("x (m)", ">8.2f"), ("share", ">9.1%"))
+    rows = [("a", np.float64(-1.236), 0.5), ("bb", "unknown", 0.25), ("none",)]
+    assert table_lines(columns, rows) == [
+        "name     x (m)    share",
+        "a        -1.24    50.0%",
+        "bb     unknown    25.0%",
+        "none  ",
+    ]
+    assert aligned_lines([("a", "10", "text"), ("long", "5", "")], right=(1,)) == ["a     10  text", "long   5"]
+    assert aligned_lines([]) == []
+
+
+def test_a_file_has_digits_and_words_for_what_is_unknown(tmp_path):
+    frame = pd.DataFrame({"name": ["a,b", "c"], "x": [1 / 3, np.nan], "n": [1, 2]})
+    write_csv(frame, tmp_path / "a.csv", digits=9)
+    assert (tmp_path / "a.csv").read_bytes() == b'name,x,n\n"a,b",0.333333333,1\nc,,2\n'
+    write_csv(frame, tmp_path / "a.csv", unknown="nan")
+    assert (tmp_path / "a.csv").read_text().splitlines()[1:] == ['"a,b",0.3333333333333333,1', "c,nan,2"]

@@ -1,15 +1,20 @@
-"""The loop over passes: goals, forecasts, empty records and time limits, with passes that render nothing."""
+"""Passes until their number, the error or the time ends a render, and its options."""
 
 import contextlib
+import inspect
+import re
 import signal
+from dataclasses import fields
 
 import numpy as np
 import pytest
 from rows import each_row, refuses
 
+import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import declared
 from mitransient_lidar.rendering import passes
-from mitransient_lidar.rendering.passes import SMALLEST_PASS_COUNT, Goal, Progress, run_passes
+from mitransient_lidar.rendering.passes import SMALLEST_PASS_COUNT, Goal, Progress, RenderOptions, run_passes
 
 
 class Clock:
@@ -120,3 +125,23 @@ def test_an_interruption_waits_for_its_pass_alone(monkeypatch, at, kept):
     finally:
         signal.signal(signal.SIGINT, before)
     assert clock.passes == at
+
+
+NAMES = [one.name for one in fields(RenderOptions)]
+
+
+def test_render_has_all_options_and_documents_their_ranges():
+    parameters = inspect.signature(mitransient_lidar.render).parameters
+    assert set(NAMES) < set(parameters)
+    parts = re.split(r"^(\w[\w, ]*)\n(?=    )", inspect.getdoc(mitransient_lidar.render), flags=re.MULTILINE)
+    described = {name: text for names, text in zip(parts[1::2], parts[2::2], strict=True) for name in names.split(", ")}
+    for name, (_, option) in declared(RenderOptions).items():
+        assert option.range() in " ".join(described[name].split()), name
+
+
+def test_values_at_the_ends_are_accepted_and_texts_are_numbers():
+    for name, (_, option) in declared(RenderOptions).items():
+        for value in () if option.low is None else {option.high if option.above else option.low, option.high} - {None}:
+            error = {"target_error": 1.0} if name == "target_quantile" else {}
+            assert getattr(RenderOptions(**{name: value}, **error), name) == value
+    assert RenderOptions(max_time="5").max_time == 5.0

@@ -1,4 +1,4 @@
-"""Limits of time axes that fit by themselves, against closed forms of single paths."""
+"""Automatic time axes against geometry, and the system attenuation of Gordon (1982)."""
 
 import math
 
@@ -8,7 +8,8 @@ from oracles.refracted_path import refracted_path
 from rows import each_row
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.axis_limits import Cone, LidarView, Solid
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.axis_limits import Cone, LidarView, Solid, system_attenuation
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -198,3 +199,16 @@ def test_a_given_number_wins():
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, start_ns=1380.3) == TimeAxis(1380.3, 1.0, 175)
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, bin_count=40) == TimeAxis(1395.0, 1.0, 40)
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, start_ns=2000.0).bin_count == 5
+
+
+@each_row(
+    (0.3, 0.17, 0.0, 0.3, 1e-15),
+    # Gordon: Kd beyond c R of 5 to 6. Here c R = 5, D = 2 R: exp(-8.5) = 2.0e-4 of c - Kd is left.
+    (0.5, 0.1, 20.0, 0.1 + 0.4 * 2.035e-4, 1e-6),
+    # c D = 1: exp(-0.85) = 0.42741; with the radius in place of the diameter it would be exp(-0.425) = 0.65377.
+    (0.25, 0.05, 4.0, 0.05 + 0.2 * 0.42741, 1e-5),
+)
+def test_from_c_for_narrow_spots_to_kd_for_wide_ones(attenuation, kd, spot, expected, tolerance):
+    assert system_attenuation(attenuation, kd, spot) == pytest.approx(expected, rel=tolerance)
+    with pytest.raises(UserError, match=r"kd = 0\.6 must not exceed attenuation = "):
+        system_attenuation(attenuation, [0.05, 0.6], 1)

@@ -1,14 +1,20 @@
-"""Figures and animations of gate stacks: contents, positions and colours."""
+"""Figures and animations of gate stacks and of images by daylight: contents, positions and colours."""
 
 import numpy as np
 import pytest
-from figure_inputs import stack
+from figure_inputs import frames, stack
 from PIL import Image
 
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.gates.echoes import plot_depths
-from mitransient_lidar.plots.gates.images import animate_gates, colour_scale, plot_gates, reached_by_surface
+from mitransient_lidar.plots.gates.images import (
+    animate_gates,
+    animate_passive,
+    colour_scale,
+    plot_gates,
+    reached_by_surface,
+)
 
 ROWS, COLUMNS = 4, 5
 
@@ -126,3 +132,19 @@ def test_wrong_files_and_datasets(tmp_path):
         animate_gates(make(pixels=True), tmp_path / "a.gif")
     with pytest.raises(UserError, match="No such file"):
         plot_gates(make(1), tmp_path / "missing" / "a.png")
+
+
+def test_animation_shows_the_frames_in_their_time(tmp_path):
+    radiances = frames()
+    animate_passive(radiances, tmp_path / "a.gif")
+    animate_passive(radiances.isel(column=slice(None, None, -1)), tmp_path / "turned.gif")
+    assert (tmp_path / "turned.gif").read_bytes() == (tmp_path / "a.gif").read_bytes()
+    with Image.open(tmp_path / "a.gif") as movie:
+        assert (movie.n_frames, movie.info["duration"], movie.info["loop"]) == (3, 250, 0)
+        assert movie.size == (400, 320)  # 8 x 8 points a pixel, for a width of at least 384
+        shown = []
+        for index in range(3):
+            movie.seek(index)
+            shown.append(np.asarray(movie.convert("L"))[4::8, 4::8])
+    assert shown[0][1, 2] == shown[1][3, 4] == 255
+    assert np.corrcoef(shown[2].ravel(), radiances["radiance"][2].values.ravel())[0, 1] > 0.99
