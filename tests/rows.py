@@ -64,8 +64,17 @@ def each_case(*rows):
     return decorate
 
 
+def must_refuse(message, function, /, *arguments, **options):
+    """Check that a call is refused in one line that contains the message, or matches it as a pattern."""
+    with pytest.raises(UserError) as caught:
+        function(*arguments, **options)
+    sentence = str(caught.value)
+    assert message in sentence or re.search(message, sentence), f"{message!r} is not in: {sentence}"
+    assert "\n" not in sentence
+
+
 def refuses(*rows):
-    """Return a decorator as `each_row`: each row is refused in one line that contains its last entry, or matches it."""
+    """Return a decorator as `each_row`: a call with each row is refused by what its last entry says."""
 
     def decorate(test):
         parameters = list(inspect.signature(test).parameters.values())
@@ -73,11 +82,7 @@ def refuses(*rows):
 
         @functools.wraps(test)
         def refused(*, message, **given):
-            with pytest.raises(UserError) as caught:
-                test(**given)
-            sentence = str(caught.value)
-            assert message in sentence or re.search(message, sentence), f"{message!r} is not in: {sentence}"
-            assert "\n" not in sentence
+            must_refuse(message, test, **given)
 
         count = len(rows[0]) - 1
         refused.__signature__ = inspect.Signature([*parameters[:count], message, *parameters[count:]])

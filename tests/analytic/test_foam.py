@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 import rasterio
 from oracles.beam_average import echo_energies
-from rows import each_row
+from rows import each_row, must_refuse
 from significance import assert_equal, largest_z, mean_and_error
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.sea import OCEAN_SURFACE
 from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 from mitransient_lidar.physics.sea.cox_munk import LAWS, cox_munk, foam_cover, foam_whiteness
@@ -152,8 +151,7 @@ def test_a_mask_is_read_as_a_map(tmp_path):
     assert (moved.foam[(x > 1) & (x < 3) & (y > 0) & (y < 6)] == 1).all()
     assert (moved.foam[(x < 0) | (x > 4) | (y < -1) | (y > 7)] == 0).all()
     np.savez(path, heights=255 * mask, x=np.arange(-4.0, 5.0), y=np.arange(-4.0, 5.0))
-    with pytest.raises(UserError, match=r"mask.npz has values from 0 to 255: shares of foam lie from 0 to 1"):
-        read(foam_map=str(path))
+    must_refuse(r"mask.npz has values from 0 to 255: shares of foam lie from 0 to 1", read, foam_map=str(path))
 
 
 def test_infrared_foam_is_half_as_white():
@@ -183,5 +181,4 @@ def test_laws_and_refusals():
     nested = {"type": "ocean_surface", "foam": "0.1", "rough": {"type": "roughdielectric"}}
     with pytest.raises(Exception, match="is beside ripples, which a nested bsdf replaces"):
         mi.load_dict(nested)
-    with pytest.raises(UserError, match="foam"):
-        foam_cover("-0.1", 5.0)
+    must_refuse("foam", foam_cover, "-0.1", 5.0)

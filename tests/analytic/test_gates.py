@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.gates import transmission
-from rows import each_case, refuses
+from rows import each_case, must_refuse, refuses
 from scipy.ndimage import gaussian_filter
 from significance import largest_z
 
@@ -198,8 +198,7 @@ def test_smoothed_images_are_those_of_other_passes_smoothed(lidar_scene):
         assert np.median(own / total) < 0.1
     with pytest.raises(UserError, match=r"smooth = 2 pixels needs gates in the film, and a layout of rows"):
         render(lidar_scene(), smooth=2.0)
-    with pytest.raises(UserError, match="smooth = 2 keeps gates alone: leave out components"):
-        render(scene, smooth=2.0, batches=4)
+    must_refuse("smooth = 2 keeps gates alone: leave out components", render, scene, smooth=2.0, batches=4)
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import significance
-from rows import refuses
+from rows import must_refuse, refuses
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
@@ -74,8 +74,7 @@ def test_scenes_that_the_model_is_not_for(scene, params):
 def test_series_and_derivatives_need_other_light():
     with pytest.raises(UserError, match="light = 'level' must be one of merging, maps"):
         mitransient_lidar.render_shots("table1", LEVEL, count=2, light="level")
-    with pytest.raises(UserError, match="light = 'level' has no derivatives"):
-        look("table1", LEVEL, derivatives="attenuation")
+    must_refuse("light = 'level' has no derivatives", look, "table1", LEVEL, derivatives="attenuation")
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import significance
 import xarray as xr
-from rows import each_case
+from rows import each_case, must_refuse
 from scipy.stats import f as f_distribution
 
 import mitransient_lidar
@@ -118,8 +118,7 @@ def test_series_by_maps_are_rendered_again():
 )
 def test_what_maps_are_not_for(options, message):
     for render, more in ((mitransient_lidar.render, {}), (mitransient_lidar.render_shots, {"positions": [[0, 0]]})):
-        with pytest.raises(UserError, match=message):
-            render("table1", **more, **options)
+        must_refuse(message, render, "table1", **more, **options)
 
 
 @pytest.mark.slow

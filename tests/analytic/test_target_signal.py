@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from rows import refuses
+from rows import must_refuse, refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.studies.detection import detect
@@ -107,8 +107,7 @@ def test_target_above_the_sea_is_refused(lidar_scene):
 
 @pytest.mark.slow
 def test_map_needs_a_target_that_can_be_moved():
-    with pytest.raises(UserError, match="has no parameter target_x"):
-        target_map("fig09_2x2", None, [0.0], [0.0], passes=16)
+    must_refuse("has no parameter target_x", target_map, "fig09_2x2", None, [0.0], [0.0], passes=16)
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ import significance
 import zarr
 from command_line import assert_refused, run
 from quick_campaign import QUICK, files_of, planned_copy, write_toml
+from rows import must_refuse
 
 from mitransient_lidar.campaigns import shard as shards
 from mitransient_lidar.campaigns import workers
@@ -23,7 +24,6 @@ from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open
 from mitransient_lidar.campaigns.sweep import campaign as run_campaign
 from mitransient_lidar.campaigns.sweep import resume
 from mitransient_lidar.campaigns.versions import FILES, check_versions
-from mitransient_lidar.core.errors import UserError
 
 
 @pytest.mark.slow
@@ -120,13 +120,11 @@ def test_a_store_of_other_versions_is_not_completed(quick, tmp_path, caplog):
     now = group.attrs["versions"]
     group.attrs["versions"] = {**now, "mitsuba": "3.9.0"}
     text = r"older\.zarr was begun by other versions, and here is mitsuba 3\.9\.1 instead of 3\.9\.0: install those"
-    with pytest.raises(UserError, match=text):
-        resume(path, workers=1)
+    must_refuse(text, resume, path, workers=1)
     # Stores of version 0.2 have less.
     del group.attrs["versions"]
     group.attrs["drjit_version"] = "1.4.0"
-    with pytest.raises(UserError, match=r"drjit 1\.5\.0 instead of 1\.4\.0"):
-        resume(path, workers=1)
+    must_refuse(r"drjit 1\.5\.0 instead of 1\.4\.0", resume, path, workers=1)
     assert (Store(path).status() == PLANNED).all()
     check_versions(path, {"versions": {**now, FILES: "0123456789ab"}})
     assert "files of this package have changed since" in caplog.text
@@ -211,8 +209,7 @@ def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch
 def test_shards_that_cannot_be_rendered_are_left(quick, tmp_path, monkeypatch):
     path = planned_copy(quick, tmp_path / "left.zarr")
     monkeypatch.setattr(workers, "render_in_process", lambda path, shard, *_: shards.Outcome(0, 0, "shard 0: lost"))
-    with pytest.raises(UserError, match=r"2 of 2 shards are not complete, .* shard 0: lost; .*left\.zarr\.log"):
-        resume(path, workers=1)
+    must_refuse(r"2 of 2 shards are not complete, .* shard 0: lost; .*left\.zarr\.log", resume, path, workers=1)
 
 
 @pytest.mark.long

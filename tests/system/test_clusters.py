@@ -17,7 +17,7 @@ import psutil
 import pytest
 from command_line import assert_refused, run
 from quick_campaign import files_of, planned_copy
-from rows import each_case
+from rows import each_case, must_refuse
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.campaigns import shard as shards
@@ -118,8 +118,7 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
         with pytest.raises(OSError, match="Timed out trying to connect"):
             resume(path, scheduler=client)
         monkeypatch.setattr(client, "status", "connecting")
-        with pytest.raises(UserError, match="the scheduler was lost: what is written is kept"):
-            resume(path, scheduler=client)
+        must_refuse("the scheduler was lost: what is written is kept", resume, path, scheduler=client)
         monkeypatch.undo()
         # One that is stopped never answers.
         monkeypatch.setattr(workers, "_ANSWER_S", 1)
@@ -128,8 +127,7 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
         process.send_signal(signal.SIGSTOP)
         goes_on = threading.Timer(30, process.send_signal, (signal.SIGCONT,))
         goes_on.start()
-        with pytest.raises(UserError, match="the scheduler was lost: what is written is kept"):
-            resume(path, scheduler=client)
+        must_refuse("the scheduler was lost: what is written is kept", resume, path, scheduler=client)
         assert not goes_on.finished.is_set()
         goes_on.cancel()
         process.send_signal(signal.SIGCONT)
@@ -145,8 +143,7 @@ def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
         [*command, "--listen-address", "tcp://127.0.0.1:0", "--contact-address", nowhere], **SILENT
     ) as worker:
         address = json.loads(scheduler[1].read_text())["address"]
-        with pytest.raises(UserError, match=r"cannot reach its worker at tcp://127\.0\.0\.1:9"):
-            resume(path, scheduler=address)
+        must_refuse(r"cannot reach its worker at tcp://127\.0\.0\.1:9", resume, path, scheduler=address)
         worker.kill()
 
 

@@ -8,7 +8,7 @@ import pytest
 import significance
 from command_line import assert_refused, run
 from oracles import las_reader
-from rows import each_case
+from rows import each_case, must_refuse
 from significance import largest_z
 
 from mitransient_lidar.campaigns.store import DONE, FAILED, Store
@@ -331,8 +331,7 @@ def test_infrared_lines_of_their_own(tmp_path):
     assert read_points(tmp_path / "flight").sizes == points.sizes
     with pytest.raises(UserError, match=r"infrared = true and \[infrared_lines\] are alternatives"):
         FlightPlan.of_file({**plan, "infrared": True})
-    with pytest.raises(UserError, match="has no infrared channel"):
-        FlightPlan.of_file({**plan, "instrument": "riegl_vq840g"})
+    must_refuse("has no infrared channel", FlightPlan.of_file, {**plan, "instrument": "riegl_vq840g"})
 
 
 @pytest.mark.slow
@@ -364,5 +363,4 @@ def test_flight_over_a_pier(tmp_path, in_this_process):
     assert np.count_nonzero(beside & (kind == PointClass.BOTTOM)) == 4
     store = Store(tmp_path / "flight" / STORE)
     store.variables.remove("echo_class")
-    with pytest.raises(UserError, match="is of an earlier version, without echo classes: fly into another folder"):
-        Flown.of(store)
+    must_refuse("is of an earlier version, without echo classes: fly into another folder", Flown.of, store)

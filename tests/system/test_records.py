@@ -6,11 +6,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from command_line import assert_refused, run
-from rows import each_case
+from rows import each_case, must_refuse
 from significance import largest_z, mean_and_error
 
 import mitransient_lidar
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.transport.probe import Probe
@@ -150,8 +149,7 @@ def test_a_scene_without_water():
 )
 def test_invalid_records_are_refused(params, sentence, tmp_path):
     params = {"spectrum": "flat", **params}
-    with pytest.raises(UserError, match=sentence):
-        mitransient_lidar.render("table1", params=params, passes=2)
+    must_refuse(sentence, mitransient_lidar.render, "table1", params=params, passes=2)
     words = [word for name, value in params.items() for word in ("-D", f"{name}={value}")]
     assert_refused(run("render", "table1", "-q", "-o", tmp_path, *words), sentence)
     assert list(tmp_path.iterdir()) == []

@@ -7,7 +7,7 @@ import time
 import mitsuba as mi
 import numpy as np
 import pytest
-from rows import each_case
+from rows import each_case, must_refuse
 from scipy.stats import t
 from significance import largest_z
 
@@ -91,8 +91,7 @@ def test_result_says_how_it_was_made_also_of_a_loaded_scene():
     scene = loading.open_scene("table1", params).scene
     loaded = small(scene, seed=11)
     np.testing.assert_allclose(loaded.impulse_response, shot.impulse_response, rtol=1e-10)
-    with pytest.raises(UserError, match="params"):
-        small(scene, params={"wind_speed": 1})
+    must_refuse("params", small, scene, params={"wind_speed": 1})
 
 
 @pytest.mark.slow

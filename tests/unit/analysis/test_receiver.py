@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from rows import refuses
+from rows import must_refuse, refuses
 from significance import largest_z
 from small_results import made
 
@@ -378,8 +378,7 @@ def test_the_receiver_of_the_instrument_is_the_default():
     assert own.attrs["receiver"] == "riegl_vq840g"
     assert own.attrs["receiver.amplifier.bandwidth_mhz"] == 300
     assert detect_waveforms(make()).attrs["receiver"] == "apd"
-    with pytest.raises(UserError, match=r"chain = 'eye' must be one of ideal, .*apd"):
-        detect_waveforms(make(), "eye")
+    must_refuse(r"chain = 'eye' must be one of ideal, .*apd", detect_waveforms, make(), "eye")
 
 
 def test_a_record_behind_a_measured_response_is_written(tmp_path):

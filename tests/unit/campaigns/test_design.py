@@ -4,7 +4,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 
 from mitransient_lidar.campaigns.design import Campaign, Expression, Range
 from mitransient_lidar.campaigns.sweep import render_row
@@ -155,8 +155,7 @@ def test_tables_are_refused_before_they_take_memory(parameters, design, message)
         {"scene": "table1", "parameters": {f"p{i}": RANGE for i in range(parameters)}, "design": design}
     )
     tracemalloc.start()
-    with pytest.raises(UserError, match=message):
-        campaign.table()
+    must_refuse(message, campaign.table)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2**20
@@ -165,8 +164,7 @@ def test_tables_are_refused_before_they_take_memory(parameters, design, message)
 def test_unknown_parameters_are_refused_before_the_table_is_made(monkeypatch):
     campaign = Campaign.of_file(changed(parameters={"nothing": RANGE}, fixed=None, design={"count": 10**6}))
     monkeypatch.setattr(Campaign, "table", lambda self: pytest.fail("the table was made"))
-    with pytest.raises(UserError, match="parameter 'nothing' is not one of scene table1"):
-        render_row(campaign, 0)
+    must_refuse("parameter 'nothing' is not one of scene table1", render_row, campaign, 0)
 
 
 @each_row(

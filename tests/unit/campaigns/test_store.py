@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from rows import each_case, each_row
+from rows import each_case, each_row, must_refuse
 
 from mitransient_lidar.campaigns import sweep
 from mitransient_lidar.campaigns.design import Campaign
@@ -197,8 +197,7 @@ def test_damaged_values_are_not_read(full, path):
     with pytest.raises(UserError, match=r"campaign\.zarr is damaged"), reporting_damage(path):
         data["waveform"].load()
     (path / "waveform" / "zarr.json").write_text("{")
-    with pytest.raises(UserError, match=r"campaign\.zarr is damaged"):
-        Store(path)
+    must_refuse(r"campaign\.zarr is damaged", Store, path)
 
 
 @each_row("time", "time_input", "pixel", "run", "shot", "layout")
@@ -214,8 +213,7 @@ def test_damaged_coordinates_are_refused(damage, name, made, tmp_path):
 def test_a_store_that_has_lost_an_array_is_refused(name, made, tmp_path):
     path = shutil.copytree(made / "full", tmp_path / "campaign.zarr")
     shutil.rmtree(path / name)
-    with pytest.raises(UserError, match=rf"campaign\.zarr is damaged: (it has lost {name}|{name} cannot be read)"):
-        open_campaign(path)
+    must_refuse(rf"campaign\.zarr is damaged: (it has lost {name}|{name} cannot be read)", open_campaign, path)
 
 
 @pytest.mark.parametrize(
@@ -240,8 +238,7 @@ def test_edited_attributes_are_refused(full, path, change, message, sealed):
     if sealed and not message:
         Store(path)
         return
-    with pytest.raises(UserError, match=message if sealed else "is no store|its attributes have changed"):
-        Store(path)
+    must_refuse(message if sealed else "is no store|its attributes have changed", Store, path)
 
 
 def test_a_store_that_another_process_has_just_made(full, path):
@@ -308,13 +305,11 @@ def test_links_in_a_store_are_not_followed(store, path, tmp_path, name):
     (path / name).rename(victim)
     (path / name).symlink_to(victim)
     for read in (Store, open_campaign, describe_campaign):
-        with pytest.raises(UserError, match=f"{name} is a link, and no link in it is followed"):
-            read(path)
+        must_refuse(f"{name} is a link, and no link in it is followed", read, path)
     os.mkfifo(victim.with_name("pipe"))
     (path / name).unlink()
     victim.with_name("pipe").rename(path / name)
-    with pytest.raises(UserError, match=rf"{name}: it is a named pipe"):
-        Store(path)
+    must_refuse(rf"{name}: it is a named pipe", Store, path)
 
 
 def test_an_include_in_the_scene_of_a_store_is_refused(store, path):

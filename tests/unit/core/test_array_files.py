@@ -5,10 +5,8 @@ import zipfile
 import h5netcdf
 import numpy as np
 import OpenEXR
-import pytest
-from rows import each_row
+from rows import each_row, must_refuse
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.array_files import read_exr, read_netcdf, read_npy, read_npz
 
 VALUES = np.arange(12.0).reshape(3, 4)
@@ -21,8 +19,7 @@ def test_numpy_files(tmp_path):
     arrays = read_npz(tmp_path / "a.npz", ("a", "b", "missing"))
     assert list(arrays) == ["a", "b"]
     np.testing.assert_array_equal(arrays["b"], VALUES[0])
-    with pytest.raises(UserError, match=r"a.npz is damaged, or is not an archive"):
-        read_npz(tmp_path / "a.npz", ("other",))
+    must_refuse(r"a.npz is damaged, or is not an archive", read_npz, tmp_path / "a.npz", ("other",))
 
 
 def test_exr_channels_have_the_top_row_first(tmp_path):
@@ -47,12 +44,10 @@ SHAPES = ("(3, 4", "(3, -4)", "(3, 1e3)", "(3, {)", "(" * 200 + ")" * 200, "(10*
 def test_damaged_arrays_are_refused_in_one_sentence(data, tmp_path):
     """NumPy's parser raises what Python's does: SyntaxError, TokenError, RecursionError, ..."""
     (tmp_path / "a.npy").write_bytes(data)
-    with pytest.raises(UserError, match=r"a\.npy is damaged, or is not one array"):
-        read_npy(tmp_path / "a.npy")
+    must_refuse(r"a\.npy is damaged, or is not one array", read_npy, tmp_path / "a.npy")
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("a.npy", data)
-    with pytest.raises(UserError, match=r"a\.npz is damaged, or is not an archive"):
-        read_npz(tmp_path / "a.npz", ["a"])
+    must_refuse(r"a\.npz is damaged, or is not an archive", read_npz, tmp_path / "a.npz", ["a"])
 
 
 def test_arrays_that_are_much_larger_than_their_file_are_refused(tmp_path):
@@ -70,8 +65,6 @@ def test_arrays_that_are_much_larger_than_their_file_are_refused(tmp_path):
     data = (tmp_path / "a.exr").read_bytes()
     window = b"dataWindow\0box2i\0\x10\0\0\0" + bytes(8)
     (tmp_path / "a.exr").write_bytes(data.replace(window + b"\3\0\0\0\2\0\0\0", window + b"\3\0\0\0\0\0\0\4"))
-    with pytest.raises(UserError, match=r"a\.exr holds arrays of 1024 MiB, and 256 MiB are the most"):
-        read_exr(tmp_path / "a.exr")
+    must_refuse(r"a\.exr holds arrays of 1024 MiB, and 256 MiB are the most", read_exr, tmp_path / "a.exr")
     for read, name in ((read_npy, "a.npy"), (lambda path: read_npz(path, ["a"]), "a.npz"), (read_netcdf, "a.nc")):
-        with pytest.raises(UserError, match=rf"{name} holds arrays of 2289 MiB, and 256 MiB are the most"):
-            read(tmp_path / name)
+        must_refuse(rf"{name} holds arrays of 2289 MiB, and 256 MiB are the most", read, tmp_path / name)

@@ -7,7 +7,7 @@ import threading
 import h5py
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse
 
 from mitransient_lidar.core.errors import LINES, UserError, printable
 from mitransient_lidar.core.files import (
@@ -61,8 +61,7 @@ def test_a_file_that_becomes_a_pipe_after_its_check_is_refused(tmp_path, monkeyp
     os.mkfifo(tmp_path / "pipe")
     regular = os.stat(__file__)
     monkeypatch.setattr("mitransient_lidar.core.files.os.stat", lambda path: regular)
-    with pytest.raises(UserError, match="it is a named pipe"):
-        open_file(tmp_path / "pipe")
+    must_refuse("it is a named pipe", open_file, tmp_path / "pipe")
 
 
 def test_a_folder_with_links_or_pipes_is_refused(tmp_path):
@@ -72,12 +71,10 @@ def test_a_folder_with_links_or_pipes_is_refused(tmp_path):
     check_tree(folder)
     for name in ("link", "a/link", "a/b/link"):
         (folder / name).symlink_to(folder / "a")
-        with pytest.raises(UserError, match=f"{name} is a link, and no link in it is followed"):
-            check_tree(folder)
+        must_refuse(f"{name} is a link, and no link in it is followed", check_tree, folder)
         (folder / name).unlink()
     os.mkfifo(folder / "a" / "pipe")
-    with pytest.raises(UserError, match="a/pipe: it is a named pipe"):
-        check_tree(folder)
+    must_refuse("a/pipe: it is a named pipe", check_tree, folder)
 
 
 @pytest.mark.parametrize("place", ["link", "dangling link", "pipe", "folder"])
@@ -101,8 +98,7 @@ def test_a_pipe_that_someone_reads_is_no_log(tmp_path):
     log = tmp_path / "a.zarr.log"
     os.mkfifo(log)
     descriptor = os.open(log, os.O_RDONLY | os.O_NONBLOCK)
-    with pytest.raises(UserError, match="it is a named pipe"):
-        open_log(log)
+    must_refuse("it is a named pipe", open_log, log)
     os.close(descriptor)
 
 
@@ -130,8 +126,7 @@ def referring(request, tmp_path):
 
 def test_values_in_other_files_are_refused(referring):
     for read in (check_hdf5, read_netcdf):
-        with pytest.raises(UserError, match=r"into another file|in other files"):
-            read(referring)
+        must_refuse(r"into another file|in other files", read, referring)
 
 
 def test_values_in_a_pipe_are_not_waited_for(tmp_path):

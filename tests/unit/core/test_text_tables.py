@@ -5,9 +5,8 @@ import logging
 import numpy as np
 import pandas as pd
 import pytest
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.tables import text_tables
 from mitransient_lidar.core.tables.headings import TIME, Column
 from mitransient_lidar.core.tables.text_tables import read_table, read_time_samples
@@ -83,11 +82,9 @@ def test_unclear_tables_are_rejected(text, path):
 def test_large_files_are_rejected_at_once(path):
     """Three million rows would take half a minute."""
     path.write_text("time,power\n" + "1,2\n" * 3_000_000)
-    with pytest.raises(UserError, match=r"table.txt has 3000001 lines: a table may have 1000000"):
-        read_time_samples(path, POWER)
+    must_refuse(r"table.txt has 3000001 lines: a table may have 1000000", read_time_samples, path, POWER)
     path.write_text("time,power\n" + "100,200\n" * 3_000_000)
-    with pytest.raises(UserError, match=r"table.txt is larger than 16 MiB, the most for a file of this kind"):
-        read_time_samples(path, POWER)
+    must_refuse(r"table.txt is larger than 16 MiB, the most for a file of this kind", read_time_samples, path, POWER)
 
 
 @pytest.mark.parametrize("text", ["x," * 10**5 + "\n1,2\n", "a b c d\n" * 20_000 + "1 2\n"])
@@ -95,8 +92,7 @@ def test_headings_are_looked_for_in_the_first_letters_alone(path, text, monkeypa
     path.write_text(text)
     asked = []
     monkeypatch.setattr(text_tables, "parse_heading", lambda text, columns: asked.append(text))
-    with pytest.raises(UserError, match="has no heading with known columns"):
-        read_table(path, (TIME, POWER))
+    must_refuse("has no heading with known columns", read_table, path, (TIME, POWER))
     assert len(asked) <= 2**16
 
 

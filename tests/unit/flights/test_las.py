@@ -13,7 +13,7 @@ import pyproj
 import pytest
 import xarray as xr
 from oracles import las_reader
-from rows import each_case, each_row
+from rows import each_case, each_row, must_refuse
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError, WriteError
@@ -341,8 +341,7 @@ def test_wrong_points(name, value, message, tmp_path, points, waveforms):
     path = tmp_path / "waveforms.las"
     path.write_text("former")
     points[name].values[7] = value
-    with pytest.raises(UserError, match=re.escape(message)):
-        write_waveforms(path, points, waveforms)
+    must_refuse(re.escape(message), write_waveforms, path, points, waveforms)
     assert path.read_text() == "former"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -356,8 +355,7 @@ def test_wrong_points(name, value, message, tmp_path, points, waveforms):
 )
 def test_wrong_waveforms(changes, message, tmp_path, points):
     values = waveform_dataset(np.full((SHOTS * PIXELS, SAMPLES), 0.5), **changes)
-    with pytest.raises(UserError, match=re.escape(message)):
-        write_waveforms(tmp_path / "waveforms.las", points, values)
+    must_refuse(re.escape(message), write_waveforms, tmp_path / "waveforms.las", points, values)
     assert not any(tmp_path.iterdir())
 
 
@@ -368,8 +366,7 @@ def test_later_waveforms_that_differ(tmp_path: Path, points: xr.Dataset, wavefor
         (waveform_dataset(np.zeros((20, SAMPLES)), gain=1e-3), "gain = 0.001 must be that of the first waveforms"),
     ):
         packets[1] = second
-        with pytest.raises(UserError, match=re.escape(message)):
-            write_waveforms(tmp_path / "waveforms.las", parts, packets)
+        must_refuse(re.escape(message), write_waveforms, tmp_path / "waveforms.las", parts, packets)
         assert not any(tmp_path.iterdir())
 
 

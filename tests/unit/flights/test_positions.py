@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
-from rows import refuses
+from rows import must_refuse, refuses
 from scipy.spatial.transform import Rotation
 from significance import largest_chi2, largest_z
 from synthetic_shots import DEPTH, THETA, N, result
@@ -13,7 +13,6 @@ from synthetic_shots import DEPTH, THETA, N, result
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.analysis.waveforms.echo_table import extract
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
 from mitransient_lidar.flights.refracted_paths import PoseErrors
 from mitransient_lidar.flights.sea_surface import SurfaceModel
@@ -384,10 +383,8 @@ def test_the_sea_is_fitted_to_surface_points():
     assert sea.points is not None
     assert len(sea.points) == 800
     assert abs(sea.level - 0.5 - waves.mean()) < largest_z(10**6) * sea.level_error
-    with pytest.raises(UserError, match="planes need the times of the pulses, gps_time"):
-        fit_surface(points.drop_vars("gps_time"), 0.05)
-    with pytest.raises(UserError, match="no surface echo"):
-        fit_surface(points.isel(point=points["kind"].values == PointClass.BOTTOM), 0.05)
+    must_refuse("planes need the times of the pulses, gps_time", fit_surface, points.drop_vars("gps_time"), 0.05)
+    must_refuse("no surface echo", fit_surface, points.isel(point=points["kind"].values == PointClass.BOTTOM), 0.05)
 
 
 @refuses(

@@ -5,7 +5,7 @@ import re
 import mitsuba as mi
 import pyproj
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse
 
 from mitransient_lidar import scenes
 from mitransient_lidar.core.errors import UserError
@@ -51,8 +51,7 @@ def test_a_map_lies_where_the_flight_has_its_points(tmp_path, own):
     check_maps(from_file(tmp_path, place), scene)
     other = [place[0], place[1] - 10, 0.0]
     for plan in (from_file(tmp_path, other, crs="EPSG:32633", origin=other), from_file(tmp_path, other)):
-        with pytest.raises(UserError, match=r"the map of shape bed has .*: give the seabed origin_x = 5000\d0 and"):
-            check_maps(plan, scene)
+        must_refuse(r"the map of shape bed has .*: give the seabed origin_x = 5000\d0 and", check_maps, plan, scene)
 
 
 @each_row((32633, None), (25833, None), (23033, "212"), (32632, r"3.48e\+05"), (None, None))
@@ -65,8 +64,7 @@ def test_maps_are_in_the_system_of_the_flight(of_map, beside, tmp_path):
     if beside is None:
         check_maps(plan, scene)
     else:
-        with pytest.raises(UserError, match=rf"shape bed .* are {beside} m beside .* in WGS 84 / UTM zone 33N: both"):
-            check_maps(plan, scene)
+        must_refuse(rf"shape bed .* are {beside} m beside .* in WGS 84 / UTM zone 33N: both", check_maps, plan, scene)
     # Without coordinates of points nothing is known of the flight.
     check_maps(from_file(tmp_path, place), scene)
 
@@ -114,5 +112,4 @@ def test_an_sbet_file_is_in_the_system_of_the_points():
     pytest.importorskip("pyproj")
     for crs in ("EPSG:32633", "EPSG:32633+5773"):
         check_same_system(crs, 32633)
-        with pytest.raises(UserError, match=r"epsg = 32634 of the platform must be .* crs = 'EPSG:32633"):
-            check_same_system(crs, 32634)
+        must_refuse(r"epsg = 32634 of the platform must be .* crs = 'EPSG:32633", check_same_system, crs, 32634)

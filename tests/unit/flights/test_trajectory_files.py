@@ -1,7 +1,7 @@
 import numpy as np
 import pyproj
 import pytest
-from rows import each_case, each_row, refuses
+from rows import each_case, each_row, must_refuse, refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.platforms import platform_of
@@ -179,5 +179,4 @@ def test_sbet_where_the_projection_has_another_scale(longitude, latitude, epsg, 
     message = (
         rf"record 1: latitude = {latitude:g} and longitude = {longitude:g} deg must .*; its scale there is {scale}"
     )
-    with pytest.raises(UserError, match=message):
-        read_sbet_records(tmp_path / "flight.sbet", epsg)
+    must_refuse(message, read_sbet_records, tmp_path / "flight.sbet", epsg)

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import pytest
 import references
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.parameters.catalogue import unit_of
@@ -84,8 +84,7 @@ def test_files_of_the_guides_are_copied_with_the_data_that_they_name(tmp_path):
 
 def test_copy_overwrites_nothing(folder, tmp_path):
     (tmp_path / "target.ply").write_text("mine")
-    with pytest.raises(UserError, match=r"target\.ply exists already"):
-        catalogue.copy_scene("fig09", tmp_path)
+    must_refuse(r"target\.ply exists already", catalogue.copy_scene, "fig09", tmp_path)
     assert (tmp_path / "target.ply").read_text() == "mine"
     assert not (tmp_path / "fig09.xml").exists()
 

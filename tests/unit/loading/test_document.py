@@ -3,9 +3,8 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from rows import each_case
+from rows import each_case, must_refuse
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue, scenes
 from mitransient_lidar.loading.document import read_document
 
@@ -157,8 +156,7 @@ def test_part_beside_the_including_file_is_found(scene):
 def test_wrong_includes(part, text, sentence, scene):
     (scene.parent / part).write_bytes(text if isinstance(text, bytes) else text.encode())
     for use in (read_document, catalogue.scene_parameters, catalogue.copy_scene, scenes.open_scene):
-        with pytest.raises(UserError, match=sentence):
-            use(scene)
+        must_refuse(sentence, use, scene)
 
 
 def test_includes_that_double_are_refused_at_once(tmp_path):
@@ -168,8 +166,7 @@ def test_includes_that_double_are_refused_at_once(tmp_path):
         (tmp_path / f"{number}.xml").write_text(f'<scene version="3.0.0">{part}{part}</scene>')
     (tmp_path / "27.xml").write_text('<scene version="3.0.0"/>')
     for use in (read_document, catalogue.scene_parameters, scenes.open_scene):
-        with pytest.raises(UserError, match=r"scene .*0\.xml includes more than 256 files, which is the limit"):
-            use(tmp_path / "0.xml")
+        must_refuse(r"scene .*0\.xml includes more than 256 files, which is the limit", use, tmp_path / "0.xml")
 
 
 def test_parameters_that_double_are_refused_at_once(tmp_path):
@@ -177,8 +174,7 @@ def test_parameters_that_double_are_refused_at_once(tmp_path):
     parameters = [f'<default name="p{n:02}" value="$p{n + 1:02},$p{n + 1:02}"/>' for n in range(40)]
     shape = '<default name="p40" value="1"/><shape type="sphere"><float name="radius" value="$p00"/></shape>'
     (tmp_path / "bomb.xml").write_text(f'<scene version="3.0.0">{"".join(parameters)}{shape}</scene>')
-    with pytest.raises(UserError, match=r"p00 = .* has more than a million characters"):
-        scenes.open_scene(tmp_path / "bomb.xml")
+    must_refuse(r"p00 = .* has more than a million characters", scenes.open_scene, tmp_path / "bomb.xml")
 
 
 @pytest.mark.parametrize("folder", ["maps", "$x"])
@@ -199,8 +195,7 @@ def test_dollar_signs_in_values_are_taken_as_they_are(tmp_path, monkeypatch, fol
             assert again.scene.bbox().max.z == pytest.approx(-6)
             assert again.source.parameters["file"] == given
     own.write_text(text.replace('value="$depth"', 'value="$dept"'))
-    with pytest.raises(UserError, match=r"depth = '\$dept' refers to an unknown parameter of the scene"):
-        scenes.open_scene(own)
+    must_refuse(r"depth = '\$dept' refers to an unknown parameter of the scene", scenes.open_scene, own)
 
 
 def test_folders_of_a_scene_are_those_beside_it(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.core.errors import UserError
@@ -150,10 +150,8 @@ def test_files_of_the_scene_are_found_with_an_instrument(tmp_path, monkeypatch):
 )
 def test_unknown_instruments_are_refused(name, sentence):
     for call in (catalogue.read_instrument, catalogue.instrument_text):
-        with pytest.raises(UserError, match=sentence):
-            call(name)
-    with pytest.raises(UserError, match=sentence):
-        scenes.open_scene("table1", None, name)
+        must_refuse(sentence, call, name)
+    must_refuse(sentence, scenes.open_scene, "table1", None, name)
 
 
 @refuses(

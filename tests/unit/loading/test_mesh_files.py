@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from array_inputs import mesh
-from rows import each_case
+from rows import each_case, must_refuse
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.checks import check_ply
@@ -39,8 +39,7 @@ def with_index(path, index):
 def test_faces_without_a_vertex_are_refused(square, index):
     with_index(square, index)
     scene = {"type": "scene", "mesh": {"type": "ply", "filename": str(square)}}
-    with pytest.raises(UserError, match=f"has a face with the vertex {index}, and the vertices 0 to 3 alone"):
-        open_scene(scene)
+    must_refuse(f"has a face with the vertex {index}, and the vertices 0 to 3 alone", open_scene, scene)
 
 
 def test_the_mesh_of_a_result_is_checked(square):
@@ -70,8 +69,7 @@ def test_the_mesh_of_a_result_is_checked(square):
 )
 def test_headers_that_lie_are_refused(old, new, square):
     change(square, old, new)
-    with pytest.raises(UserError, match=r"is damaged, or is not a PLY file of triangles|has a face with the vertex"):
-        check_ply(square)
+    must_refuse(r"is damaged, or is not a PLY file of triangles|has a face with the vertex", check_ply, square)
 
 
 def test_a_message_that_quotes_other_bytes_than_text_is_a_sentence(tmp_path):
@@ -107,8 +105,7 @@ def test_checks_agree_with_what_mitsuba_reads(tmp_path, order):
     np.testing.assert_array_equal(found, faces["i"])
     faces["i"][-1, 2] = 1000
     write()
-    with pytest.raises(UserError, match="has a face with the vertex 1000"):
-        check_ply(path)
+    must_refuse("has a face with the vertex 1000", check_ply, path)
 
 
 @pytest.mark.parametrize("kind", ["gridvolume", "sdfgrid"])
@@ -125,5 +122,4 @@ def test_grids_of_other_sizes_than_their_header_says_are_refused(tmp_path, kind)
         with pytest.raises(UserError, match=r"grid.vol has \d+ bytes, and says that it holds .* cells"):
             open_scene({"type": "scene", "part": held})
     path.write_bytes(b"VOL")
-    with pytest.raises(UserError, match=r"grid.vol is damaged, or is not a grid of Mitsuba"):
-        open_scene({"type": "scene", "part": held})
+    must_refuse(r"grid.vol is damaged, or is not a grid of Mitsuba", open_scene, {"type": "scene", "part": held})

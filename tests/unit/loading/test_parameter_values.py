@@ -2,10 +2,8 @@
 
 import json
 
-import pytest
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.document import parse_document
 from mitransient_lidar.loading.parameters import fill, value_of, with_value
 from mitransient_lidar.loading.scenes import open_scene
@@ -54,10 +52,8 @@ def test_numbers_are_found_by_name_and_one_changes(name, value, text):
     ("altitude", "altitude = nan must be finite"),
 )
 def test_others_are_refused(name, message):
-    with pytest.raises(UserError, match=message):
-        value_of(PARAMETERS, name)
-    with pytest.raises(UserError, match=message):
-        with_value(PARAMETERS, name, float("nan"))
+    must_refuse(message, value_of, PARAMETERS, name)
+    must_refuse(message, with_value, PARAMETERS, name, float("nan"))
 
 
 OWN = """<scene version="3.0.0"><default name="deep" value="6"/>

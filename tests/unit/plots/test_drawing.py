@@ -5,9 +5,8 @@ import pytest
 import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rows import each_row
+from rows import each_row, must_refuse
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import drawing
 
 
@@ -89,8 +88,6 @@ def test_figures_replace_a_file_only_on_success(tmp_path):
     figure = drawing.new_figure(path, 2.0, 1.0)
     figure.set_layout_engine("none")
     figure.draw = lambda *_, **__: (_ for _ in ()).throw(OSError(28, "No space left on device"))
-    with pytest.raises(UserError, match=r"cannot write .*a\.png: No space left on device"):
-        drawing.save(figure, path)
+    must_refuse(r"cannot write .*a\.png: No space left on device", drawing.save, figure, path)
     assert (path.read_text(), len(list(tmp_path.iterdir()))) == ("before", 1)
-    with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):
-        drawing.new_figure(tmp_path / "a.gif", 2.0, 1.0)
+    must_refuse(r"must end in \.png, \.pdf or \.svg", drawing.new_figure, tmp_path / "a.gif", 2.0, 1.0)

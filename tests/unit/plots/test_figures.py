@@ -7,8 +7,8 @@ import pytest
 import references
 from drawn_figures import described, differences
 from figure_inputs import FIGURES, campaign, shot_statistics
+from rows import must_refuse
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.profiles import Profile
 from mitransient_lidar.plots.campaigns import plot_campaign
 from mitransient_lidar.plots.water import plot_profile
@@ -54,10 +54,8 @@ def test_codes_near_nothing_are_not_drawn():
 
 def test_nothing_to_draw(tmp_path):
     made = campaign()
-    with pytest.raises(UserError, match="no run that is done"):
-        plot_campaign(made.assign(status=0 * made["status"]))
-    with pytest.raises(UserError, match="must end in"):
-        plot_campaign(made, tmp_path / "campaign.txt")
+    must_refuse("no run that is done", plot_campaign, made.assign(status=0 * made["status"]))
+    must_refuse("must end in", plot_campaign, made, tmp_path / "campaign.txt")
 
 
 def test_correlations_are_those_of_the_panels():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 
 import mitransient_lidar
 from mitransient_lidar import results
@@ -56,8 +56,7 @@ def test_unknown_names_are_refused(names, renderer):
 def test_backscattering_without_influence_is_refused(water, lidar_scene):
     scene = lidar_scene(integrator=FEW, water=water)
     renderer = scene.integrator().prepare(scene, scene.sensors()[0])
-    with pytest.raises(UserError, match="backscattering: the light does not depend on it"):
-        path_parameters(renderer, ["backscattering"])
+    must_refuse("backscattering: the light does not depend on it", path_parameters, renderer, ["backscattering"])
 
 
 @pytest.mark.parametrize("phase_g", [0.0, 0.02, -0.3])
@@ -111,8 +110,7 @@ def test_results_with_derivatives(tmp_path):
     assert held.identical(shot)
     again = mitransient_lidar.render(tmp_path / "shot.nc")
     np.testing.assert_array_equal(again["waveform_derivative"], shot["waveform_derivative"])
-    with pytest.raises(UserError, match="cannot store the variable"):
-        results.save(shot, tmp_path / "shot.exr")
+    must_refuse("cannot store the variable", results.save, shot, tmp_path / "shot.exr")
 
 
 @pytest.mark.slow

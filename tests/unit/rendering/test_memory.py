@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import xarray as xr
-from rows import each_case
+from rows import each_case, must_refuse
 
 import mitransient_lidar
 from mitransient_lidar.core import validation
@@ -91,8 +91,7 @@ def test_passes_that_exceed_the_memory_are_refused(integrator, count, monkeypatc
     options = mi.load_dict({"type": integrator, count: 2**28}, parallel=False)
     renderer = options.prepare(session.scene, session.sensor)
     monkeypatch.setattr(validation, "usable_memory", lambda: 2e9)
-    with pytest.raises(UserError, match=rf"2684\d+ .*paths take .* GB of memory, .*: take fewer .*{count}"):
-        renderer.render_pass(0)
+    must_refuse(rf"2684\d+ .*paths take .* GB of memory, .*: take fewer .*{count}", renderer.render_pass, 0)
 
 
 def fitted(monkeypatch, memory, **layout):
@@ -136,14 +135,10 @@ def test_a_pass_of_cut_buffers_has_the_bits_of_one_of_large_ones(monkeypatch):
 
 def test_meshes_series_and_frames_that_exceed_the_memory_are_refused(monkeypatch):
     monkeypatch.setattr(validation, "usable_memory", lambda: 1e9)
-    with pytest.raises(UserError, match=r"1 meshes of 2114 x 2114 cells take 1\.25 GB"):
-        grid_indices(2048, 50_000)
-    with pytest.raises(UserError, match=r"1 meshes of 17592186044416 x 17592186044416 cells"):
-        grid_indices(2**44, 50_000)
-    with pytest.raises(UserError, match=r"64 meshes of 5.. x 5.. cells take .* GB"):
-        grid_indices(512, 1000, 2.0, meshes=64)
-    with pytest.raises(UserError, match=r"1000 shots of 4 pixels x 4000 bins take 1\.02 GB"):
-        check_size(1000, 4, 4000)
+    must_refuse(r"1 meshes of 2114 x 2114 cells take 1\.25 GB", grid_indices, 2048, 50_000)
+    must_refuse(r"1 meshes of 17592186044416 x 17592186044416 cells", grid_indices, 2**44, 50_000)
+    must_refuse(r"64 meshes of 5.. x 5.. cells take .* GB", grid_indices, 512, 1000, 2.0, meshes=64)
+    must_refuse(r"1000 shots of 4 pixels x 4000 bins take 1\.02 GB", check_size, 1000, 4, 4000)
     with pytest.raises(UserError, match=r"1000 frames of 65536 pixels take 3\.94 GB"):
         render_passive("passive_sea", {"layout": "256x256"}, frames=1000)
 

@@ -8,7 +8,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
@@ -87,8 +87,7 @@ def test_empty_passes_end_with_an_error(monkeypatch, goal, ended):
     def verify(count):
         raise UserError(f"no light in {count} passes")
 
-    with pytest.raises(UserError, match=f"no light in {ended} passes"):
-        run_passes(clock.render_pass, goal, seed=0, verify=verify)
+    must_refuse(f"no light in {ended} passes", run_passes, clock.render_pass, goal, seed=0, verify=verify)
     assert clock.passes == ended
 
 

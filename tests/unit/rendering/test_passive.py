@@ -6,7 +6,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import xarray as xr
-from rows import refuses
+from rows import must_refuse, refuses
 from significance import largest_z
 
 import mitransient_lidar
@@ -157,8 +157,7 @@ def test_frames_move_the_sea_and_fill_files(tmp_path):
     save(pictures.isel(frame=0), tmp_path / "b.exr")
     with OpenEXR.File(str(tmp_path / "b.exr"), separate_channels=True) as file:
         assert len(file.parts) == 1
-    with pytest.raises(UserError, match=r"must end in \.exr, \.nc"):
-        save(pictures, tmp_path / "a.txt")
+    must_refuse(r"must end in \.exr, \.nc", save, pictures, tmp_path / "a.txt")
     # A flat sea has nothing that moves: frames differ by noise only.
     flat = no_none(scene())
     flat["sea"]["spectrum"] = "flat"

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.echo_times import bottom_time_ns
-from rows import each_case, refuses
+from rows import each_case, must_refuse, refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.level_sea import snell
@@ -137,8 +137,7 @@ def test_sphere_inside_out_is_refused_or_told(lidar_scene, caplog, mirror, flips
     place = TO_WORLD.translate([on_axis(-5.0), 0, -5]).scale([mirror * 0.5, 0.5, 0.5])
     scene = lidar_scene(extra={"ball": {"type": "sphere", "to_world": place, "flip_normals": flips}})
     if outcome is UserError:
-        with pytest.raises(UserError, match="to_world of sphere 'ball' mirrors it"):
-            check(scene, caplog)
+        must_refuse("to_world of sphere 'ball' mirrors it", check, scene, caplog)
         return
     assert ["faces of shape 'ball' point inwards" in one for one in check(scene, caplog)] == [True] * outcome
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import run
-from rows import each_case, each_row
+from rows import each_case, each_row, must_refuse
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
@@ -272,6 +272,5 @@ def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, t
     ("fig09_2x2", {"positions": PLACES, "move_target": True}, "has no parameter target_x, which move_target needs"),
 )
 def test_invalid_input_is_refused_before_rendering(scene, options, message, rendered):
-    with pytest.raises(UserError, match=message):
-        shot_series.render_shots(scene, FLAT, **options)
+    must_refuse(message, shot_series.render_shots, scene, FLAT, **options)
     assert not rendered

@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 import xarray as xr
-from rows import each_row
+from rows import each_row, must_refuse
 from small_results import made
 
 from mitransient_lidar import results
@@ -175,8 +175,7 @@ def test_images_of_many_bins_have_several_parts(tmp_path):
     own = {"mitransientLidar": parts[0].attributes["mitransientLidar"]}
     kept = {name: image for name, image in parts[1].channels.items() if not name.startswith("wave0100")}
     exr.write(tmp_path / "b.exr", [parts[0]._replace(attributes=own), parts[1]._replace(attributes={}, channels=kept)])
-    with pytest.raises(UserError, match="damaged"):
-        results.open(tmp_path / "b.exr")
+    must_refuse("damaged", results.open, tmp_path / "b.exr")
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".nc"])
@@ -184,11 +183,9 @@ def test_failed_save_leaves_no_file(tmp_path, suffix):
     (tmp_path / "file").write_text("regular")
     with pytest.raises(UserError, match=rf"cannot write .*file/a{suffix}: .*Not a directory"):
         results.save(make(), tmp_path / "file" / f"a{suffix}")
-    with pytest.raises(UserError, match=r"cannot write .*missing/a"):
-        results.save(make(), tmp_path / "missing" / f"a{suffix}")
+    must_refuse(r"cannot write .*missing/a", results.save, make(), tmp_path / "missing" / f"a{suffix}")
     (tmp_path / f"folder{suffix}").mkdir()
-    with pytest.raises(UserError, match=r"cannot write .*: Is a directory"):
-        results.save(make(), tmp_path / f"folder{suffix}")
+    must_refuse(r"cannot write .*: Is a directory", results.save, make(), tmp_path / f"folder{suffix}")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", f"folder{suffix}"]
 
 
@@ -203,7 +200,5 @@ def test_time_axis_from_attributes_or_from_the_coordinate():
     one = dataset.isel(time=[3])
     assert results.time_axis(one).start_ns == pytest.approx(1401.0)
     for invalid in (one.assign_attrs(bin_width_ns="wide"), dataset.assign_coords(time=dataset["time"][::-1].values)):
-        with pytest.raises(UserError, match=r"no attribute bin_width_ns|no two increasing times"):
-            results.time_axis(invalid)
-    with pytest.raises(UserError, match="no coordinate time"):
-        results.time_axis(dataset.drop_vars("time"))
+        must_refuse(r"no attribute bin_width_ns|no two increasing times", results.time_axis, invalid)
+    must_refuse("no coordinate time", results.time_axis, dataset.drop_vars("time"))

@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
-from rows import each_row
+from rows import each_row, must_refuse
 from small_results import made
 
 from mitransient_lidar import results
@@ -78,8 +78,7 @@ def test_a_damaged_file_is_refused_before_hdf5_reads_it(tmp_path, dataset):
     whole = path.read_bytes()
     for place in (100, len(whole) // 2, len(whole) - 100):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
-        with pytest.raises(UserError, match=r"a\.nc is damaged or truncated: its SHA-256 is another one"):
-            results.open(path)
+        must_refuse(r"a\.nc is damaged or truncated: its SHA-256 is another one", results.open, path)
 
 
 def test_files_that_other_programs_have_changed_are_read(tmp_path, dataset):
@@ -109,8 +108,7 @@ def test_both_channels_are_what_they_were(tmp_path):
     for dataset in (both, results.open(tmp_path / "both.nc")):
         for own, expected in zip(split(dataset), (green, infrared), strict=True):
             xr.testing.assert_identical(own, expected)
-    with pytest.raises(UserError, match=r"an EXR file holds no infrared channel; use a .nc file"):
-        results.save(both, tmp_path / "both.exr")
+    must_refuse(r"an EXR file holds no infrared channel; use a .nc file", results.save, both, tmp_path / "both.exr")
     own, none = split(green)
     xr.testing.assert_identical(own, green)
     assert none is None

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from command_line import run
 from differentiated import PHOTON, result
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 from significance import largest_z
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels
@@ -135,8 +134,7 @@ def test_interrupted_renders_are_not_kept(monkeypatch, tmp_path):
     ({"nuisances": {"phase": 1}}, "nuisance = 'phase' must be one of time_offset, scale"),
 )
 def test_invalid_input_is_refused_before_a_render(options, message, rendered):
-    with pytest.raises(UserError, match=message):
-        study.bounds("table1", SMALL, **{"free": ["attenuation"], **options})
+    must_refuse(message, study.bounds, "table1", SMALL, **{"free": ["attenuation"], **options})
     assert not rendered
 
 

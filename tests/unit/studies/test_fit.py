@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import xarray as xr
 from closed_form_waveform import TRUTH, closed_form, noisy
-from rows import refuses
+from rows import must_refuse, refuses
 
 import mitransient_lidar
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering.passes import Progress
 from mitransient_lidar.studies import fit as study
 
@@ -44,8 +43,7 @@ def test_starts_are_those_of_the_scene_and_seeds_differ_from_the_result(renders)
     assert fitted.attrs["scene"] == "table1"
     error = fitted["value"].values - [TRUTH[name] for name in NAMES]
     assert np.abs(error / fitted["stderr"]).max() < 6
-    with pytest.raises(UserError, match="seed = 5 is that of the result"):
-        mitransient_lidar.fit(data, "table1", NAMES, seed=5)
+    must_refuse("seed = 5 is that of the result", mitransient_lidar.fit, data, "table1", NAMES, seed=5)
 
 
 def test_options_change_the_fit(renders):

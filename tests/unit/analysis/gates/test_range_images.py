@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from figure_inputs import LIDAR, stack
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 from scipy.special import ndtr
 from scipy.stats import binom, chi2
 
 from mitransient_lidar.analysis.gates.range_images import depth_image, range_from_gates
 from mitransient_lidar.analysis.receiver import detect_waveforms
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.results.geometry import LinesOfSight
 
 MID = 0.5 + 0.25 * np.arange(64)
@@ -121,8 +120,7 @@ def test_gates_with_gaps_give_no_depths():
         {"gate_start": ("gate", 18.0 * np.arange(4)), "gate_width": ("gate", np.full(4, 10.0))},
         {"pulse_fwhm_ns": 5.0},
     )
-    with pytest.raises(UserError, match="the gates leave gaps of 8 ns"):
-        depth_image(stack)
+    must_refuse("the gates leave gaps of 8 ns", depth_image, stack)
 
 
 def echoes_in_an_image(joules):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from closed_form_waveform import TIME, TRUTH, closed_form, noisy
-from rows import refuses
+from rows import must_refuse, refuses
 from scipy.special import ndtr
 from significance import largest_z
 
@@ -58,8 +58,7 @@ def test_a_result_has_its_own_errors(tmp_path):
     np.testing.assert_array_equal(found.values, data["waveform"])
     np.testing.assert_array_equal(found.stderr, data["waveform_stderr"])
     assert found.calibrated
-    with pytest.raises(UserError, match="receiver is that of a signal or a table"):
-        measured(light, receiver="apd")
+    must_refuse("receiver is that of a signal or a table", measured, light, receiver="apd")
     with pytest.raises(UserError, match="source is another dataset, but must have waveforms over time or signals"):
         measured(xr.Dataset({"energy": data["waveform"]}))
 
@@ -74,11 +73,9 @@ def test_a_signal_is_the_mean_of_its_records(tmp_path):
     # A sample that one record has not stored is missing: the mean of the others would be that of the high ones.
     gap = recorded["signal"].where((recorded["shot"] != 2) | (recorded["time"] != 20))
     assert np.flatnonzero(np.isnan(measured(recorded.assign(signal=gap)).values[0])).tolist() == [20]
-    with pytest.raises(UserError, match=r"noise = 0\.1 is that of the receiver"):
-        measured(recorded, noise=0.1)
+    must_refuse(r"noise = 0\.1 is that of the receiver", measured, recorded, noise=0.1)
     del recorded.attrs["receiver"]
-    with pytest.raises(UserError, match="the signal does not name its receiver"):
-        measured(recorded)
+    must_refuse("the signal does not name its receiver", measured, recorded)
 
 
 @pytest.mark.parametrize("receiver", ["apd", "pmt_log", "spad"])

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse
 from scipy.signal import fftconvolve
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Focusing
 from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape, Response, Template
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
@@ -75,8 +74,7 @@ def test_onset_is_the_blurred_column_and_has_its_derivatives(sigma):
     ([0.0, 1.0], [2.0, 1.0]),
 )
 def test_invalid_focusing_is_refused(depths, factors):
-    with pytest.raises(UserError, match="wave_focusing"):
-        Focusing.from_attributes({"wave_focusing_depths": depths, "wave_focusing": factors})
+    must_refuse("wave_focusing", Focusing.from_attributes, {"wave_focusing_depths": depths, "wave_focusing": factors})
 
 
 @pytest.mark.parametrize("estimator", ["gaussian", "peak", "centroid"])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from rows import each_row
+from rows import each_row, must_refuse
 from scipy.stats import exponnorm, norm
 
 from mitransient_lidar import results
@@ -134,5 +134,4 @@ def test_corrections_of_another_surface_are_refused():
         UserError, match="from green light, but depths count from infrared light: take one of depth-bias"
     ):
         check_surface(green, infrared=True)
-    with pytest.raises(UserError, match="from infrared light, but depths count from green light"):
-        check_surface(infrared, infrared=False)
+    must_refuse("from infrared light, but depths count from green light", check_surface, infrared, infrared=False)

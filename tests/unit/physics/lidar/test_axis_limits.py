@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 from oracles.refracted_path import refracted_path
-from rows import each_row
+from rows import each_row, must_refuse
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.axis_limits import Cone, LidarView, Solid, system_attenuation
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
@@ -210,5 +209,4 @@ def test_a_given_number_wins():
 )
 def test_from_c_for_narrow_spots_to_kd_for_wide_ones(attenuation, kd, spot, expected, tolerance):
     assert system_attenuation(attenuation, kd, spot) == pytest.approx(expected, rel=tolerance)
-    with pytest.raises(UserError, match=r"kd = 0\.6 must not exceed attenuation = "):
-        system_attenuation(attenuation, [0.05, 0.6], 1)
+    must_refuse(r"kd = 0\.6 must not exceed attenuation = ", system_attenuation, attenuation, [0.05, 0.6], 1)

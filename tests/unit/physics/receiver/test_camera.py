@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse
 from significance import largest_chi2, largest_z, variance_limits
 
 from mitransient_lidar.core.errors import UserError
@@ -185,7 +185,5 @@ def test_files_are_refused_in_a_sentence(text: str, message: str, tmp_path) -> N
 
 
 def test_each_kind_of_receiver_names_the_other() -> None:
-    with pytest.raises(UserError, match=r"'iccd' is a camera, which records gates: .* pmt"):
-        waveform_receiver("iccd")
-    with pytest.raises(UserError, match="'pmt' is one of waveforms, but gates need a camera: iccd"):
-        camera("pmt")
+    must_refuse(r"'iccd' is a camera, which records gates: .* pmt", waveform_receiver, "iccd")
+    must_refuse("'pmt' is one of waveforms, but gates need a camera: iccd", camera, "pmt")

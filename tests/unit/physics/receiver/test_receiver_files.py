@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
@@ -180,10 +180,8 @@ def test_invalid_files_are_refused_in_one_sentence(text, message):
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(UserError, match="receiver = 'tube' must be one of ideal"):
-        receiver("tube")
-    with pytest.raises(UserError, match="own"):
-        receiver("own.toml")
+    must_refuse("receiver = 'tube' must be one of ideal", receiver, "tube")
+    must_refuse("own", receiver, "own.toml")
 
 
 def write_response(folder, times, values):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from oracles.wave_spectra import mesh_slope_variance
-from rows import each_row
+from rows import each_row, must_refuse
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
@@ -73,8 +73,7 @@ def test_series_has_the_moments_of_its_terms():
 
 
 def test_series_of_strong_wind_or_a_small_part_is_refused():
-    with pytest.raises(UserError, match="slope_distribution 'gram_charlier' = 15 must lie"):
-        GramCharlierSeries.of_clean_sea(15)
+    must_refuse("slope_distribution 'gram_charlier' = 15 must lie", GramCharlierSeries.of_clean_sea, 15)
     series, total = GramCharlierSeries.of_clean_sea(6.0), cox_munk(6.0)
     halves, fifths = (series.of_part(total, (share * total[0], share * total[1])) for share in (0.5, 0.2))
     halves.require_positive("")

@@ -16,7 +16,7 @@ import pytest
 import rasterio
 import xarray as xr
 from array_inputs import write_bag
-from rows import each_row
+from rows import each_row, must_refuse
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.height_maps import read_height_map
@@ -354,8 +354,7 @@ def test_what_is_no_height_is_refused_in_one_sentence(kind, content, options, me
         ("csv", Content(with_holes(-9999.0 * FT) / FT, more={"heading": "x_m,y_m,z_ft"}), {"no_data": -9999}),
         ("csv", Content(more={"change": lambda text: text.replace("-5.000000000", "NA", 12)}), {}),)  # fmt: skip
 def test_declared_holes_are_refused_or_filled(kind, content, options, tmp_path):
-    with pytest.raises(UserError, match="has holes, 12 of 441 heights"):
-        read(tmp_path, kind, content, **options)
+    must_refuse("has holes, 12 of 441 heights", read, tmp_path, kind, content, **options)
     found = read(tmp_path, kind, content, holes="fill", **options)
     np.testing.assert_allclose(found.heights[:, :-1], -5, rtol=0, atol=1e-6)
     assert found.filled.sum() == 12

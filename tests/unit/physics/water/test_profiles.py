@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import xarray as xr
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 from scipy.integrate import quad
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.profiles import BACKSCATTERING_FLOOR, COEFFICIENT_FLOOR, Profile, read_profile
 
 # a and b do not change alike, bb/b neither; the first node lies below the surface.
@@ -230,8 +229,7 @@ def test_direction_of_netcdf_depths(tmp_path, positive, sign, name):
     xr.Dataset(water, {name: (name, [0.0, 4.0 * sign], {"positive": positive})}).to_netcdf(path, engine="h5netcdf")
     np.testing.assert_array_equal(read_profile(path).depth, [0, 4])
     xr.Dataset(water, {name: (name, [0.0, -4.0 * sign], {"positive": positive})}).to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(UserError, match="depth = -4 must not be negative"):
-        read_profile(path)
+    must_refuse("depth = -4 must not be negative", read_profile, path)
 
 
 def test_depths_in_feet_of_us_surveys(tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from figure_inputs import frames, stack
 from PIL import Image
+from rows import must_refuse
 
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
@@ -112,26 +113,20 @@ def test_depth_map_needs_three_gates_with_depths(tmp_path):
         UserError, match=r"1 of 60 gates lie below from_depth = 5\.6 m, but a drawing of depths needs at least 3"
     ):
         plot_depths(made, tmp_path / "a.png", from_depth=5.6)
-    with pytest.raises(UserError, match="0 of 3 gates lie below the surface echo"):
-        plot_depths(make(3), tmp_path / "a.png")
-    with pytest.raises(UserError, match="no gate_depth"):
-        plot_depths(made.drop_vars("gate_depth"), tmp_path / "a.png")
+    must_refuse("0 of 3 gates lie below the surface echo", plot_depths, make(3), tmp_path / "a.png")
+    must_refuse("no gate_depth", plot_depths, made.drop_vars("gate_depth"), tmp_path / "a.png")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
 def test_wrong_files_and_datasets(tmp_path):
     for draw in (plot_gates, plot_depths):
-        with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):
-            draw(make(), tmp_path / "a.gif")
-        with pytest.raises(UserError, match="no gate stack"):
-            draw(make().drop_vars("gate_energy"), tmp_path / "a.png")
-    with pytest.raises(UserError, match=r"animation must end in \.gif or \.mp4"):
-        animate_gates(make(), tmp_path / "a.png")
+        must_refuse(r"must end in \.png, \.pdf or \.svg", draw, make(), tmp_path / "a.gif")
+        must_refuse("no gate stack", draw, make().drop_vars("gate_energy"), tmp_path / "a.png")
+    must_refuse(r"animation must end in \.gif or \.mp4", animate_gates, make(), tmp_path / "a.png")
     with pytest.raises(UserError, match="this stack has 3 single pixels; draw its contact sheet"):
         animate_gates(make(pixels=True), tmp_path / "a.gif")
-    with pytest.raises(UserError, match="No such file"):
-        plot_gates(make(1), tmp_path / "missing" / "a.png")
+    must_refuse("No such file", plot_gates, make(1), tmp_path / "missing" / "a.png")
 
 
 def test_animation_shows_the_frames_in_their_time(tmp_path):
