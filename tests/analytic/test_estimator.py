@@ -28,18 +28,6 @@ def compare(first, second, largest):
     assert np.all(np.abs(z) < largest_z(min(len(first), len(second)), z.size)), z
 
 
-@pytest.mark.slow
-def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes):
-    """Same seed: the same paths, given to other pixels. A pixel counted twice or left out at an edge would show."""
-    energies = []
-    for name, seed in (("1x1", 0), ("2x2", 0), ("1x4", 0), ("1x1", 1)):
-        scene = lidar_scene(rx={"layout": name, "imager": False}, sea=WAVY, integrator={"paths_per_pass": 2**12})
-        energies.append(passes(scene, 1, seed).sum(axis=1))
-    for parts in energies[1:3]:
-        np.testing.assert_allclose(parts, energies[0], rtol=1e-10)
-    assert np.mean(energies[0] == energies[3]) < 0.6
-
-
 def with_total(energy):
     return np.concatenate([energy, energy.sum(axis=1, keepdims=True)], axis=1)
 

@@ -61,15 +61,8 @@ def test_parameters_have_the_same_names_in_every_scene():
         *("pulse_energy_mj", "pulse_fwhm_ns", "divergence_mrad", "field_of_view_mrad", "layout", "aperture_area"),
         *("altitude", "off_nadir_deg", "wind_speed", "wind_direction_deg", "spectrum", "slope_variance"),
         *("surface_seed", "refractive_index", "group_index", "attenuation", "scattering", "backscattering"),
-        *(
-            "phase_function",
-            "phase_g",
-            "bottom_depth",
-            "bottom_reflectance",
-            "time_start_ns",
-            "bin_width_ns",
-            "bin_count",
-        ),
+        *("phase_function", "phase_g", "bottom_depth", "bottom_reflectance"),
+        *("time_start_ns", "bin_width_ns", "bin_count"),
     }
     for name in catalogue.scene_names():
         # Its bottom is a stair.

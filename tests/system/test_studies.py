@@ -23,20 +23,6 @@ def texts(plot):
 
 
 @pytest.mark.slow
-def test_orders(scene, tmp_path):
-    plot = tmp_path / "new" / "orders.svg"
-    done = run("scattering", scene, *NEAR, "--orders", 3, "--passes", 2, "-o", plot, "-q")
-    lines = done.stdout.splitlines()
-    assert done.exit_code == 0, done.stderr
-    assert lines[:2] == [str(plot), str(plot.with_suffix(".nc"))]
-    assert [line.split()[0] for line in lines[3:]] == ["0", "1", "2", ">=3", "all"]
-    assert sum(float(line.split()[4]) for line in lines[3:-1]) == pytest.approx(100, abs=0.01)
-    assert texts(plot) >= {"all", "0", "1", "2", "≥ 3", "scattering events", "several", "reversals (%)"}
-    with xr.open_dataset(plot.with_suffix(".nc"), engine="h5netcdf") as found:
-        assert found["waveform"].dims == ("pixel", "reversals", "order", "time")
-
-
-@pytest.mark.slow
 def test_signal_without_a_receiver(scene, tmp_path):
     """A map of 2x2 places, whose sums are the signals of these places alone."""
     few = [*NEAR, "--receiver", "none", "--passes", 16, "-q", "-o"]

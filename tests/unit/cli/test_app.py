@@ -5,8 +5,6 @@ import io
 import logging
 import os
 import signal
-import subprocess
-import sys
 import time as clock
 from types import SimpleNamespace
 
@@ -161,31 +159,6 @@ def test_unwritable_output_is_noticed_before_rendering(scene, calls, tmp_path):
         assert_refused(run("render", scene, "-o", tmp_path / name), "its name must have no control characters")
         assert not (tmp_path / name).exists()
     assert not calls.seen
-
-
-@pytest.mark.slow
-def test_plot(scene, calls, tmp_path):
-    run("render", scene, "-o", tmp_path, "--no-plot", "--quiet")
-    result = run("view", "--plot", tmp_path / "fig09.exr")
-    assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'fig09.png'}\n")
-    both = (tmp_path / "fig09.png").read_bytes()
-    for option in ("--log", "--linear"):
-        result = run("view", "--plot", tmp_path / "fig09.nc", option, "-o", tmp_path / "b.png")
-        assert result.exit_code == 0, result.output
-        # One panel is less high than two; the height stands in bytes 20 to 24.
-        assert (tmp_path / "b.png").read_bytes()[20:24] < both[20:24]
-    assert_refused(run("view", "--plot", tmp_path / "fig09.nc", "-o", tmp_path / "a.txt"), "must end in .png")
-
-
-@pytest.mark.slow
-def test_command_line_imports_nothing_slow():
-    code = (
-        "import sys, mitransient_lidar; before = set(sys.modules); import mitransient_lidar.cli.app;"
-        "new = {name.partition('.')[0] for name in set(sys.modules) - before};"
-        "print(new & {'mitsuba', 'xarray', 'matplotlib', 'OpenEXR', 'scipy', 'numpy', 'rich'})"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\n"
 
 
 #: Sets colour and title of a terminal, rings, and turns the order of letters.

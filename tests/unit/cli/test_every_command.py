@@ -154,16 +154,7 @@ def test_command_without_a_result(command, tmp_path, monkeypatch):
 
 
 def test_every_command_is_run():
-    tested = {
-        *SCENE_COMMANDS,
-        *RESULT_COMMANDS,
-        *OTHER_COMMANDS,
-        "render",
-        "shots",
-        "compare",
-        "depth-bias",
-        "tpu",
-        "fit",
-    }
+    tested = {*SCENE_COMMANDS, *RESULT_COMMANDS, *OTHER_COMMANDS, "render", "shots", "compare"}
+    tested |= {"depth-bias", "tpu", "fit"}
     # The benchmark measures for minutes; its tests replace the renders. tests/system runs campaigns and flights.
     assert set(COMMANDS) == tested | {"bench", "campaign", "fly", "scenes list", "scenes show", "scenes copy"}

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from figure_inputs import result
 from PIL import Image
-from rows import each_case
 
 from mitransient_lidar import results
 
@@ -59,17 +58,6 @@ def test_all_kinds_of_files_in_a_new_folder(stored, tmp_path):
     names = ["scene_gates.exr", "scene_gates.gif", "scene_gates.html", *numbered]
     assert done.stdout.split() == [str(folder / name) for name in names]
     assert sorted(file.name for file in folder.iterdir()) == sorted(names)
-
-
-@pytest.mark.slow
-@each_case(
-    ((), "one start"),
-    (("--start-ns", 1410), "one shape"),
-    (("--start-ns", 1406, "--width-ns", 5), "gate train before the surface"),
-    (("--start-ns", 1550, "--width-ns", 5, "--count", 3), "within the record"),
-)
-def test_sentences(arguments, part, stored):
-    command_line.assert_refused(run(stored[0], *arguments), part)
 
 
 def test_a_stack_of_gates_has_no_histogram(stored):

@@ -12,25 +12,6 @@ from mitransient_lidar.core.formats.array_files import read_exr, read_netcdf, re
 VALUES = np.arange(12.0).reshape(3, 4)
 
 
-def test_numpy_files(tmp_path):
-    np.save(tmp_path / "a.npy", VALUES)
-    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), VALUES)
-    np.savez(tmp_path / "a.npz", a=VALUES, b=VALUES[0], other=np.array([None]))
-    arrays = read_npz(tmp_path / "a.npz", ("a", "b", "missing"))
-    assert list(arrays) == ["a", "b"]
-    np.testing.assert_array_equal(arrays["b"], VALUES[0])
-    must_refuse(r"a.npz is damaged, or is not an archive", read_npz, tmp_path / "a.npz", ("other",))
-
-
-def test_exr_channels_have_the_top_row_first(tmp_path):
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {"Y": VALUES.astype(np.float32), "Z": np.zeros((3, 4), np.float32)}) as file:
-        file.write(str(tmp_path / "a.exr"))
-    channels = read_exr(tmp_path / "a.exr")
-    assert sorted(channels) == ["Y", "Z"]
-    np.testing.assert_array_equal(channels["Y"], VALUES)
-
-
 def npy(shape, version=1):
     """Return the header of an array in NumPy's format, without its values."""
     text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}}}".encode()

@@ -11,7 +11,6 @@ import pytest
 from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin
 from oracles.phase import henyey_greenstein
 from rows import each_row
-from significance import largest_z
 
 from mitransient_lidar.physics.lidar.level_sea import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -151,23 +150,3 @@ def test_single_scattering_is_that_of_the_oracle(name):
     lit = expected > 1e-4 * expected.max()
     edge = 3e-3 * expected.max() if "bottom_depth" in case else 0.0
     np.testing.assert_allclose(found[lit], expected[lit], rtol=5e-3, atol=edge)
-
-
-@pytest.mark.slow
-def test_single_scattering_agrees_with_a_render_of_its_case():
-    """The sum of the gates by passes, and the score; light of all other cases is scattered more often."""
-    make_results = script("make_results")
-    case = CASES["single_scattering"]
-    passes = make_results.render("single_scattering", "lidar_volpath", 16)
-    expected = single_scattering.energies(case)
-    sums = passes.sum(axis=1)
-    error = sums.std(ddof=1) / 4
-    assert error < 3e-3 * expected.sum()
-    assert abs(sums.mean() - expected.sum()) < largest_z(16) * error
-    edges = make_results.gate_edges(case)
-    rendered = score.Result(edges[:-1], edges[1:], passes.mean(axis=0), passes.std(axis=0, ddof=1) / 4)
-    found = score.score(score.Result(edges[:-1], edges[1:], expected, 0 * expected), rendered)
-    assert found.gates == 40
-    assert abs(found.worst_z) < largest_z(16, 40)
-    wrong = score.score(score.Result(edges[:-1], edges[1:], 1.05 * expected, 0 * expected), rendered)
-    assert not wrong.agrees

@@ -79,14 +79,8 @@ def write_tif(path, content):
 
 def write_nc(path, content):
     x, y = _positions(content)
-    more = {
-        "name": "elevation",
-        "attributes": {},
-        "axis_unit": "",
-        "dims": ("y", "x"),
-        "axes": ("x", "y"),
-        **content.more,
-    }
+    more = {"name": "elevation", "attributes": {}, "axis_unit": "", "dims": ("y", "x"), "axes": ("x", "y")}
+    more |= content.more
     units = {"units": content.unit} if content.unit else {}
     axis = {"units": more["axis_unit"]} if more["axis_unit"] else {}
     x_name, y_name = more["axes"]

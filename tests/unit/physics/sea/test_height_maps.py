@@ -64,19 +64,6 @@ def test_top_row_of_an_exr_image_has_the_largest_y(wanted, others, kind, tmp_pat
     assert_is_the_map(read_height_map(path, 6.0), y=[-2, 0, 2])
 
 
-@pytest.mark.parametrize("name", ["height", "elevation", "sea"])
-@pytest.mark.parametrize("dims", [("y", "x"), ("x", "y")])
-def test_netcdf_with_coordinates_in_either_order(tmp_path, name, dims):
-    values = HEIGHTS if dims == ("y", "x") else HEIGHTS.T
-    more = {"mask": (dims, np.zeros(values.shape))} if name != "sea" else {"time": ((), 1.0)}
-    path = write_netcdf(tmp_path / "map.nc", values, dims, name, {"x": X, "y": Y}, **more)
-    assert_is_the_map(read_height_map(path))
-    bare = write_netcdf(tmp_path / "map.nc", HEIGHTS, ("row", "column"))
-    assert_is_the_map(read_height_map(bare, 6.0), y=[-2, 0, 2])
-    with pytest.raises(ValueError, match=r"map.nc has no positions of its heights: give the size"):
-        read_height_map(bare)
-
-
 def test_sample_returns_the_map_at_its_points_and_planes_between():
     # h = 2 + 3x - y + xy is bilinear.
     x, y = np.linspace(-3, 4, 8), np.linspace(10, 12, 5)

@@ -118,17 +118,6 @@ def test_depth_map_needs_three_gates_with_depths(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
-def test_wrong_files_and_datasets(tmp_path):
-    for draw in (plot_gates, plot_depths):
-        must_refuse(r"must end in \.png, \.pdf or \.svg", draw, make(), tmp_path / "a.gif")
-        must_refuse("no gate stack", draw, make().drop_vars("gate_energy"), tmp_path / "a.png")
-    must_refuse(r"animation must end in \.gif or \.mp4", animate_gates, make(), tmp_path / "a.png")
-    with pytest.raises(UserError, match="this stack has 3 single pixels; draw its contact sheet"):
-        animate_gates(make(pixels=True), tmp_path / "a.gif")
-    must_refuse("No such file", plot_gates, make(1), tmp_path / "missing" / "a.png")
-
-
 def test_animation_shows_the_frames_in_their_time(tmp_path):
     radiances = frames()
     animate_passive(radiances, tmp_path / "a.gif")
