@@ -373,10 +373,8 @@ def test_narrow_view_of_a_wide_beam(lidar_scene, view):
     significance.assert_equal(energy[:, 0, 1, :7], expected, error=0.02, bias=5e-3)
 
 
-@pytest.mark.parametrize(
-    "options", [pytest.param({}, marks=pytest.mark.long), pytest.param({"point_spacing": 0.4}, marks=pytest.mark.slow)]
-)
-def test_column_ends_at_the_bottom(lidar_scene, passes, options):
+@each_case(pytest.param({}, marks=pytest.mark.long), pytest.param({"point_spacing": 0.4}, marks=pytest.mark.slow))
+def test_column_ends_at_the_bottom(options, lidar_scene, passes):
     """The last tenth of a column above a black bottom; cells that it cuts lost 6 and 21 % of it."""
     height, depth, beam = 730.0, 1.4, 10.0
     surface_ns = float(surface_time_ns(height, 0.0))

@@ -6,6 +6,7 @@ from itertools import pairwise
 import drjit as dr
 import numpy as np
 import pytest
+from rows import each_case
 from significance import assert_same, largest_error, largest_z
 
 #: Cells and shortest wave are the same for every beam and view.
@@ -65,10 +66,8 @@ def test_connections_of_a_bottom_have_one_mean(lidar_scene, passes):
     assert_same(combined, walk, error=0.02)
 
 
-@pytest.mark.parametrize(
-    "sea", [pytest.param(ROUGH, marks=pytest.mark.slow), pytest.param(WAVY, marks=pytest.mark.long)]
-)
-def test_reciprocity_of_beam_and_field_of_view(lidar_scene, passes, sea):
+@each_case(pytest.param(ROUGH, marks=pytest.mark.slow), pytest.param(WAVY, marks=pytest.mark.long))
+def test_reciprocity_of_beam_and_field_of_view(sea, lidar_scene, passes):
     """A uniform beam seen by a uniform field of view, and the two exchanged, per solid angle of the field of view.
 
     A factor that is not symmetric - the n^2 of one crossing only, a one-sided cosine - would show in every bin.

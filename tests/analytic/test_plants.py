@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
+from rows import each_case
 from significance import assert_equal, largest_z, mean_and_error
 
 from mitransient_lidar.physics.plants import Canopy
@@ -56,10 +57,8 @@ def test_light_through_a_leaf_as_wide_as_the_view(lidar_scene, passes, integrato
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("integrator", "form"), [*((name, "leaves") for name in INTEGRATORS), ("lidar_volpath", "blades")]
-)
-def test_direct_echo_passes_the_gaps_once(lidar_scene, passes, integrator, form):
+@each_case(*((name, "leaves") for name in INTEGRATORS), ("lidar_volpath", "blades"))
+def test_direct_echo_passes_the_gaps_once(integrator, form, lidar_scene, passes):
     """exp(-G LAI) of black leaves, not its square: laser and receiver share the gaps."""
     # The plants of a seed vary more than a few paths.
     few = {"paths_per_pass": 2**13, "photons_per_pass": 2**13}

@@ -8,6 +8,7 @@ import pytest
 import significance
 from oracles.beam_average import echo_energies
 from oracles.refracted_path import refracted_path
+from rows import each_case
 from significance import largest_z, mean_and_error
 
 from mitransient_lidar.core.constants import C0
@@ -116,10 +117,10 @@ def echo_of(sphere):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize(
-    "sphere", [pytest.param(name, marks=pytest.mark.slow if name == STEEPEST else pytest.mark.long) for name in SPHERES]
+@each_case(
+    *zip([pytest.param(name, marks=pytest.mark.slow if name == STEEPEST else pytest.mark.long) for name in SPHERES])
 )
-def test_sphere_in_clear_water(lidar_scene, passes, integrator, sphere):
+def test_sphere_in_clear_water(sphere, lidar_scene, passes, integrator):
     """Energy and mean time against quadrature over the sphere's lit cap, which is also the one that is seen."""
     (lidar, sigma, centre, radius), (energy, time) = SPHERES[sphere], echo_of(sphere)
     pose = {"altitude": lidar.height, "off_nadir_deg": float(np.degrees(lidar.off_nadir))}

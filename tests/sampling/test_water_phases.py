@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
-from rows import each_row
+from rows import each_case, each_row
 from significance import largest_z
 
 from mitransient_lidar.physics.water import phase as closed_form
@@ -72,9 +72,7 @@ def test_molecules_of_layers_by_name_follow_their_wavelength():
         np.testing.assert_allclose(values(one), expected, rtol=2e-3)
 
 
-@pytest.mark.parametrize(
-    "own", [{}, {"phase_function": "petzold"}, {"phase_function": "hg"}, {"phase": {"type": "rayleigh"}}]
-)
+@each_case({}, {"phase_function": "petzold"}, {"phase_function": "hg"}, {"phase": {"type": "rayleigh"}})
 def test_chi_changes_what_is_near_180_degrees(own):
     plain, changed = (mi.load_dict({"type": "layered_water", **own, **chi}).water for chi in ({}, {"chi_p": 0.5}))
     before, after = (values(water.phases.at(mi.UInt32(0))) for water in (plain, changed))

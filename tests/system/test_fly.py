@@ -213,10 +213,7 @@ def assert_files(folder, points, flown):
         "corrections are of surfaces from green light",
     ),
     ({"infrared": True}, "instrument = 'published_airborne' has no infrared channel; instruments with one are"),
-    (
-        {"parameters": {**FLIGHT["parameters"], "time_start_ns": 1380, "bin_count": 60}},
-        "no bottom within the record",
-    ),
+    ({"parameters": {**FLIGHT["parameters"], "time_start_ns": 1380, "bin_count": 60}}, "no bottom within the record"),
 )
 def test_flights_that_cannot_be_rendered(change, message):
     with pytest.raises(Exception, match=message):

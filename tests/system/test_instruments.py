@@ -48,7 +48,7 @@ KINDS = ("published_mast", "icesat2_atlas", "riegl_vq840g", "teledyne_czmil", "r
             pytest.param(name, marks=pytest.mark.slow if name in KINDS else pytest.mark.long)
             for name in catalogue.instrument_names()
         ]
-    ),
+    )
 )
 def test_every_instrument_renders(name):
     """Surface and bottom return light at their times, in every channel; a scene's own lidar gives the same bits."""

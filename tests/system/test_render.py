@@ -169,8 +169,7 @@ def test_error_window_leaves_out_dark_pixels_and_counts_empty_bins_as_infinite()
 
 
 @each_case(
-    pytest.param("lidar_volpath", 24, marks=pytest.mark.slow),
-    pytest.param("lidar_merging", 16, marks=pytest.mark.long),
+    pytest.param("lidar_volpath", 24, marks=pytest.mark.slow), pytest.param("lidar_merging", 16, marks=pytest.mark.long)
 )
 def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(integrator, count, lidar_scene):
     """Same seeds, same flat sea: what the small patch receives less is what it must report, to 25 %, in most passes."""

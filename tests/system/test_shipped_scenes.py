@@ -37,7 +37,7 @@ PASSIVE = {"passive_sea"}
             pytest.param(name, marks=pytest.mark.long if name in ALIKE else pytest.mark.slow)
             for name in sorted(set(catalogue.scene_names()) - PASSIVE)
         ]
-    ),
+    )
 )
 def test_scene(name, tmp_path, caplog):
     """One small render, its files, and renders of these.

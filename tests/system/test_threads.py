@@ -11,6 +11,7 @@ import warnings
 import numpy as np
 import OpenEXR
 import pytest
+from rows import each_case
 from same_bits import assert_same_bits
 
 import mitransient_lidar
@@ -73,10 +74,8 @@ def alone():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "threads", [2, pytest.param(4, marks=pytest.mark.long), pytest.param(8, marks=pytest.mark.long)]
-)
-def test_renders_have_the_bits_of_those_alone(alone, threads):
+@each_case(2, pytest.param(4, marks=pytest.mark.long), pytest.param(8, marks=pytest.mark.long))
+def test_renders_have_the_bits_of_those_alone(threads, alone):
     """Without a lock, 2 of 6 in two threads had others: long kernels, which begin at once, overlap."""
     starts, interval = threading.Barrier(threads), sys.getswitchinterval()
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import synthetic_shots
 import xarray as xr
-from rows import each_row
+from rows import each_case, each_row
 
 import mitransient_lidar
 from mitransient_lidar.analysis.receiver import detect_waveforms
@@ -100,9 +100,7 @@ def test_what_is_given_by_mistake_is_refused_in_a_sentence(value, name, given, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [name for name in FUNCTIONS if DATASETS & {*parameters(name)} and name not in OF_FILES]
-)
+@each_case(*zip([name for name in FUNCTIONS if DATASETS & {*parameters(name)} and name not in OF_FILES]))
 def test_a_path_gives_what_its_dataset_gives(name, tmp_path):
     shots = synthetic_shots.result()
     if name == "correct_depths":

@@ -328,9 +328,7 @@ REFUSED = [
 ]
 
 
-@refuses(
-    *REFUSED,
-)
+@refuses(*REFUSED)
 def test_invalid_input(call):
     call()
 

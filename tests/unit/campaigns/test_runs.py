@@ -91,16 +91,8 @@ def test_what_is_asked_of_a_run(asked):
 
 @pytest.mark.slow
 @refuses(
-    (
-        {"bottom_dept": [1, 2]},
-        FLAT,
-        "parameter 'bottom_dept' is not one of scene table1: did you mean bottom_depth",
-    ),
-    (
-        {"altitude": [1, 2]},
-        {"windspeed": 3},
-        "parameter 'windspeed' is not one of scene table1: did you mean wind_",
-    ),
+    ({"bottom_dept": [1, 2]}, FLAT, "parameter 'bottom_dept' is not one of scene table1: did you mean bottom_depth"),
+    ({"altitude": [1, 2]}, {"windspeed": 3}, "parameter 'windspeed' is not one of scene table1: did you mean wind_"),
     ({"bin_count": [100, 200]}, FLAT, "parameter 'bin_count' must be the same in all runs"),
     ({"bottom_depth": [-3, -4]}, FLAT, "bottom_depth"),
 )

@@ -177,10 +177,7 @@ def replaced(old, new):
     (without("medium"), "ocean_surface 'surface': needs a layered_water as its interior medium"),
     (without("integrator"), "integrator: the scene has no lidar integrator"),
     (replaced("<film", '<float name="apertur_area" value="1"/><film'), "did you mean aperture_area"),
-    (
-        replaced('id="transmitter"/>', 'id="transmitter"><float name="divergense" value="1"/></emitter>'),
-        "divergense",
-    ),
+    (replaced('id="transmitter"/>', 'id="transmitter"><float name="divergense" value="1"/></emitter>'), "divergense"),
     (replaced('<float name="bin_width_ns"', '<float name="bin_with"'), "time_gated_film: there is no parameter"),
     (replaced('name="wind_speed" value="3"', 'name="wind_speed" value=""'), "wind_speed = '' is empty"),
     (replaced('"$bottom_reflectance"', '"1.2"'), "reflectance = 1.2 must lie between 0 and 1"),

@@ -51,11 +51,7 @@ CASES = {
     "shots": (["table1", *WRONG, "-o", "d/s.nc", "--figure", "d/f.svg"], ["d/s.nc", "d/f.svg", "d/f.nc"], OTHER),
     "find-shots": figure("table1", files=["png"]),
     "detect": figure("fig13_2x2", files=("pdf", "nc")),
-    "depth-bias": (
-        ["riegl_vq840g", *WRONG, "-o", "d/t.nc", "--figure", "d/t.png"],
-        ["d/t.nc", "d/t.png"],
-        INSTRUMENT,
-    ),
+    "depth-bias": (["riegl_vq840g", *WRONG, "-o", "d/t.nc", "--figure", "d/t.png"], ["d/t.nc", "d/t.png"], INSTRUMENT),
     "tpu": (
         ["riegl_vq840g", *WRONG, "-o", "d"],
         [f"d/riegl_vq840g_{end}" for end in ("tpu.nc", "150m_20deg_tvu.csv", "150m_20deg_orders.png")],

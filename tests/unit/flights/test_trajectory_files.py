@@ -75,9 +75,7 @@ def test_invalid_text(text, tmp_path):
     read_text_records(path)
 
 
-@refuses(
-    ({"kind": "csv", "file": "none.csv"}, "cannot read .*none.csv"),
-)
+@refuses(({"kind": "csv", "file": "none.csv"}, "cannot read .*none.csv"))
 def test_invalid_tables(given, tmp_path):
     _write(tmp_path / "flight.trj", [], NAMES)
     platform_of(given).trajectory(tmp_path)

@@ -95,8 +95,6 @@ REFUSED = [
 ]
 
 
-@refuses(
-    *REFUSED,
-)
+@refuses(*REFUSED)
 def test_what_does_not_fit_is_refused_in_one_sentence(call):
     call()

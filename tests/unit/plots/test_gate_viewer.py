@@ -188,10 +188,7 @@ def test_large_pages_show_means(scene, tmp_path, caplog):
         lambda stack, result: (numbered(result).drop_vars(["angle_x", "angle_y"]), "page.html"),
         "the result has no coordinate angle_x over (row, column): it has no map to draw",
     ),
-    (
-        lambda stack, result: (numbered(result), "page.html", None, 0.01),
-        "limit_mb = 0.01 is too small for this stack",
-    ),
+    (lambda stack, result: (numbered(result), "page.html", None, 0.01), "limit_mb = 0.01 is too small for this stack"),
     (lambda stack, result: (stack, "page.html", result[["waveform_stderr"]]), "has no variable waveform"),
     (lambda stack, result: (stack, "page.html", result.isel(row=slice(3))), "must be those of the gate stack"),
     (lambda stack, result: (stack.isel(row=0), "page.html"), "(row, column, gate) or (pixel, gate)"),

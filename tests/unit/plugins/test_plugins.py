@@ -224,9 +224,7 @@ WRONG_SCENES = [
 ]
 
 
-@refuses(
-    *WRONG_SCENES,
-)
+@refuses(*WRONG_SCENES)
 def test_scenes_that_are_no_lidar_scenes_are_refused(parts):
     loaded = scene(**parts)
     find_lidar_scene(loaded, loaded.sensors()[0])

@@ -69,10 +69,7 @@ def test_steps_off_nadir_shift_the_surface_as_much(level):
 
 
 @each_row(
-    ("divergence_mrad", 10, 1.0),
-    ("target_x", 0, 0.05),
-    ("attenuation[1]", 0.5, 0.005),
-    ("wind_direction_deg", 0, 0.5),
+    ("divergence_mrad", 10, 1.0), ("target_x", 0, 0.05), ("attenuation[1]", 0.5, 0.005), ("wind_direction_deg", 0, 0.5)
 )
 def test_steps_of_others(name, value, step, level):
     session, integrator = level

@@ -83,9 +83,7 @@ def test_records_that_exceed_the_memory_are_refused():
         mitransient_lidar.record(result, "apd", shots=10**9)
 
 
-@pytest.mark.parametrize(
-    ("integrator", "count"), [("lidar_merging", "photons_per_pass"), ("lidar_volpath", "paths_per_pass")]
-)
+@each_case(("lidar_merging", "photons_per_pass"), ("lidar_volpath", "paths_per_pass"))
 def test_passes_that_exceed_the_memory_are_refused(integrator, count, monkeypatch):
     session = open_scene("table1", {"bin_count": 100, "time_start_ns": 1400, "spectrum": "flat"})
     options = mi.load_dict({"type": integrator, count: 2**28}, parallel=False)
@@ -188,9 +186,7 @@ TASKS = {
 LONG = ("bins", "derivatives", "sea", "photons", "shots", "record", "passive", "frames")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.long if name in LONG else pytest.mark.slow) for name in TASKS]
-)
+@each_case(*zip([pytest.param(name, marks=pytest.mark.long if name in LONG else pytest.mark.slow) for name in TASKS]))
 def test_the_estimate_is_within_a_factor_of_two_of_the_peak(name, tmp_path):
     estimate, peak = limited(TASKS[name][0], tmp_path / "record.nc", TASKS[name][1])
     assert 0.5 < estimate / peak < 2, (estimate, peak)

@@ -130,10 +130,8 @@ def test_closed_mesh_with_faces_inwards_is_told(lidar_scene, caplog, tmp_path, i
     assert check(lidar_scene(extra={"box": {**box, "bsdf": twosided}}), caplog) == []
 
 
-@pytest.mark.parametrize(
-    ("mirror", "flips", "outcome"), [(-1, False, UserError), (-1, True, 0), (1, True, 1), (1, False, 0)]
-)
-def test_sphere_inside_out_is_refused_or_told(lidar_scene, caplog, mirror, flips, outcome):
+@each_case((-1, False, UserError), (-1, True, 0), (1, True, 1), (1, False, 0))
+def test_sphere_inside_out_is_refused_or_told(mirror, flips, outcome, lidar_scene, caplog):
     place = TO_WORLD.translate([on_axis(-5.0), 0, -5]).scale([mirror * 0.5, 0.5, 0.5])
     scene = lidar_scene(extra={"ball": {"type": "sphere", "to_world": place, "flip_normals": flips}})
     if outcome is UserError:

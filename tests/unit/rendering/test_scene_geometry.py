@@ -82,13 +82,7 @@ def test_rays_bend_at_the_boundary_of_index_layers():
 def test_rays_end_on_targets_and_reliefs_have_patches(lidar_scene):
     extra = {
         "ball": {"type": "sphere", "center": [1.0, 0.0, -4.0], "radius": 0.8},
-        "sand": {
-            "type": "seabed",
-            "depth": 6.0,
-            "reflectance": 0.2,
-            "patches": "2 1 0.5 0.4",
-            "centre_x": 2.0,
-        },
+        "sand": {"type": "seabed", "depth": 6.0, "reflectance": 0.2, "patches": "2 1 0.5 0.4", "centre_x": 2.0},
     }
     geometry = scene_geometry(open_scene(lidar_scene(bottom=None, extra=extra)))
     (ball,) = geometry.solids
@@ -152,10 +146,7 @@ def test_a_lidar_under_water_has_straight_rays(lidar_scene):
 def test_an_imager_has_its_view_and_lines_between_its_pixels():
     geometry = of_scene(layout="128x128")
     kinds = [(one.kind, one.name) for one in geometry.bundles]
-    assert kinds[:2] == [
-        ("pixel", "field of view of 16384 pixels"),
-        ("lines", "lines between blocks of 8 × 8 pixels"),
-    ]
+    assert kinds[:2] == [("pixel", "field of view of 16384 pixels"), ("lines", "lines between blocks of 8 × 8 pixels")]
     view, lines = geometry.bundles[:2]
     # Those at the rim of the circle have no length.
     assert len(lines.loops) == 2 * 15

@@ -159,11 +159,7 @@ def test_errors_of_depths_are_those_of_a_cameras_frames(frames):
 
 
 @each_row(
-    ("icmos", 3e-18, 0.1),
-    ("emccd", 1e-17, 0),
-    ("spad_camera", 1e-16, 0.05),
-    ("iccd", 1e-17, 0.1),
-    ("iccd", 1e-14, 0),
+    ("icmos", 3e-18, 0.1), ("emccd", 1e-17, 0), ("spad_camera", 1e-16, 0.05), ("iccd", 1e-17, 0.1), ("iccd", 1e-14, 0)
 )
 def test_weak_and_saturated_frames_have_depths_with_errors_that_hold_or_none(camera, joules, share):
     """Signal-to-noise ratios of 2.6 to 4.4, and saturation: depths were 1.2 to 700 standard errors off, rms."""

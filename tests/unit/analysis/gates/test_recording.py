@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
-from rows import refuses
+from rows import each_case, refuses
 from scipy.stats import norm
 from significance import largest_z, variance_limits
 
@@ -70,8 +70,8 @@ def test_frames_have_their_mean_and_deviation_and_averages_the_root_of_their_num
     assert np.allclose(recorded["snr"], snr.where(recorded["saturation"] < 0.5), rtol=1e-5, equal_nan=True)
 
 
-@pytest.mark.parametrize(
-    "name", [one if one in ("iccd", "spad_camera") else pytest.param(one, marks=pytest.mark.slow) for one in CAMERAS]
+@each_case(
+    *zip([one if one in ("iccd", "spad_camera") else pytest.param(one, marks=pytest.mark.slow) for one in CAMERAS])
 )
 def test_photon_transfer_finds_gain_and_read_out_noise(name, flat):
     one = replace(CAMERAS[name], gate_jitter_ns=0.0, hot_pixels=0.0, frame_dark=0.0, dark_current_hz=0.0)

@@ -266,19 +266,13 @@ def test_some_pixels_are_fitted_by_their_names():
 
 
 @refuses(
-    (
-        {"starts": {**TRUTH, "bottom_reflectance": 1.2}},
-        "start of bottom_reflectance = 1.2 must lie between 0 and 1",
-    ),
+    ({"starts": {**TRUTH, "bottom_reflectance": 1.2}}, "start of bottom_reflectance = 1.2 must lie between 0 and 1"),
     ({"starts": {"scale": 1.0}}, "start of scale: it is fixed"),
     ({"starts": {}}, "free = '' must name at least one parameter"),
     ({"starts": {"depth": 3.0}}, "no derivative by depth, only by attenuation, scattering, bottom_reflectance"),
     ({"bounds": {"attenuation": (0.4, 0.3)}}, "bounds of attenuation = 0.4, 0.3 must increase"),
     ({"bounds": {"scattered": (0, 1)}}, "bounds of scattered: it is not one of the free parameters attenuation"),
-    (
-        {"model": lambda values: closed_form(values, TIME + 500)},
-        "have 0 samples from 0 to 159 ns within the record",
-    ),
+    ({"model": lambda values: closed_form(values, TIME + 500)}, "have 0 samples from 0 to 159 ns within the record"),
     ({"model": lambda values: closed_form(values).drop_vars("waveform_derivative")}, "no variable waveform_deriv"),
     ({"model": lambda values: np.inf * closed_form(values)}, "waveform of the model has 160 values"),
 )

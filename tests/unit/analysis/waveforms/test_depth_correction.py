@@ -6,12 +6,7 @@ import xarray as xr
 from rows import each_row, refuses
 
 from mitransient_lidar.analysis.waveforms import depth_correction
-from mitransient_lidar.analysis.waveforms.depth_correction import (
-    AXES,
-    correct_depths,
-    summarize_depths,
-    turned_pixels,
-)
+from mitransient_lidar.analysis.waveforms.depth_correction import AXES, correct_depths, summarize_depths, turned_pixels
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 
 ECHO = ["surface", "column", "target", "bottom"]
@@ -241,10 +236,7 @@ def test_summary_of_depths():
 
 
 @refuses(
-    (
-        echoes([5.0], instrument="teledyne_czmil"),
-        "of the instrument riegl_vq840g, but the result has instrument tele",
-    ),
+    (echoes([5.0], instrument="teledyne_czmil"), "of the instrument riegl_vq840g, but the result has instrument tele"),
     (echoes([5.0], instrument=""), "but the result has no instrument"),
     (echoes([5.0], pixels=("red", "blue")), "lack the pixel 'blue'"),
     (echoes([5.0], **{"scene.wind_speed": "strong"}), "wind speed of the result is not known"),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row, must_refuse
+from rows import each_case, each_row, must_refuse
 from scipy.signal import fftconvolve
 
 from mitransient_lidar import results
@@ -14,9 +14,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 
 
-@pytest.mark.parametrize(
-    ("fwhm", "bin_ns", "tau"), [(1.5, 0.5, 0.8), (0.7, 1.0, 0.0), (5.0, 1.0, 3.0), (4.0, 0.5, 2.0)]
-)
+@each_case((1.5, 0.5, 0.8), (0.7, 1.0, 0.0), (5.0, 1.0, 3.0), (4.0, 0.5, 2.0))
 def test_other_shapes_are_sums_of_gaussians_within_a_hundredth(fwhm, bin_ns, tau):
     template = Template.of(Pulse.gaussian(fwhm), bin_ns, tau)
     shape = EchoShape.of(template)
@@ -67,11 +65,7 @@ def test_onset_is_the_blurred_column_and_has_its_derivatives(sigma):
 
 
 @each_row(
-    ([1.0, 2.0], [1.0]),
-    ([2.0, 1.0], [1.0, 1.0]),
-    ([1.0, 2.0], [1.0, -1.0]),
-    ("near", [1.0]),
-    ([0.0, 1.0], [2.0, 1.0]),
+    ([1.0, 2.0], [1.0]), ([2.0, 1.0], [1.0, 1.0]), ([1.0, 2.0], [1.0, -1.0]), ("near", [1.0]), ([0.0, 1.0], [2.0, 1.0])
 )
 def test_invalid_focusing_is_refused(depths, factors):
     must_refuse("wave_focusing", Focusing.from_attributes, {"wave_focusing_depths": depths, "wave_focusing": factors})

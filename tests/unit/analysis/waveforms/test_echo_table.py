@@ -6,20 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
-from lake_waveforms import (
-    BINS,
-    DECAY,
-    PER_NS,
-    SHIFTS,
-    SURFACE,
-    TIME,
-    column,
-    echo,
-    lit,
-    recorded,
-    result,
-    waveform,
-)
+from lake_waveforms import BINS, DECAY, PER_NS, SHIFTS, SURFACE, TIME, column, echo, lit, recorded, result, waveform
 from rows import each_row, refuses
 
 from mitransient_lidar import results

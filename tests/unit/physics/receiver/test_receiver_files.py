@@ -158,10 +158,7 @@ def test_atlas_counts_after_the_surface_what_it_was_seen_to_count():
     ('preset = "apd"\n[channels]\ndeep = 3', "channels.deep = 3 must be a table"),
     ('preset = "apd"\n[channels.deep]\npreset = "pmt"', "'preset' is no key of own.toml: channels.deep"),
     ('preset = "apd"\n[channels.deep.digitiser]\nbits = 8', "digitiser of channel 'deep' must be that of all"),
-    (
-        'preset = "apd"\n[channels.deep.amplifier]\nbandwidth_mhz = 8',
-        "amplifier of channel 'deep' must have the resp",
-    ),
+    ('preset = "apd"\n[channels.deep.amplifier]\nbandwidth_mhz = 8', "amplifier of channel 'deep' must have the resp"),
     ('preset = "spad"\n[amplifier]\ntransimpedance_ohm = 8', "amplifier must be None behind"),
     ('preset = "apd"\n[amplifier]\nimpulse_response = 3', "impulse_response = 3 must be the name of a file"),
     ('preset = "apd"\n[amplifier]\nrecovery_ns = 20', "recovery_ns = 20 needs a limit_v of the amplifier"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from rows import each_row, must_refuse, refuses
+from rows import each_case, each_row, must_refuse, refuses
 from scipy.integrate import quad
 
 from mitransient_lidar.physics.water.profiles import BACKSCATTERING_FLOOR, COEFFICIENT_FLOOR, Profile, read_profile
@@ -219,10 +219,8 @@ def test_rounded_decimals_do_not_contradict(tmp_path):
     np.testing.assert_allclose(read.attenuation, [0.315, 0])
 
 
-@pytest.mark.parametrize(
-    ("positive", "sign", "name"), [("down", 1, "z"), ("up", -1, "z"), ("Up", -1, "depth"), ("down", 1, "depth")]
-)
-def test_direction_of_netcdf_depths(tmp_path, positive, sign, name):
+@each_case(("down", 1, "z"), ("up", -1, "z"), ("Up", -1, "depth"), ("down", 1, "depth"))
+def test_direction_of_netcdf_depths(positive, sign, name, tmp_path):
     """A vertical coordinate upwards from the bottom, of positive numbers, would be taken as depths."""
     path = tmp_path / "water.nc"
     water = {one: (name, [0.2, 0.3]) for one in "ab"}
