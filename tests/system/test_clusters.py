@@ -220,8 +220,7 @@ def test_workers_of_other_versions_are_refused(quick, tmp_path, scheduler, kind)
     with subprocess.Popen(worker_command(scheduler[1], tmp_path, OTHERS[kind][0]), **SILENT) as worker:
         text = rf"the worker at tcp://127\.0\.0\.1:\d+ has {re.escape(OTHERS[kind][1])}: all that"
         try:
-            with pytest.raises(UserError, match=text):
-                resume(path, scheduler=json.loads(scheduler[1].read_text())["address"])
+            must_refuse(text, lambda: resume(path, scheduler=json.loads(scheduler[1].read_text())["address"]))
         finally:
             worker.kill()
     assert (Store(path).status() == PLANNED).all()

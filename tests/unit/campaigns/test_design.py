@@ -202,5 +202,4 @@ def test_anything_else_is_refused(text, part):
 
 @each_row("1 / (a - 1)", "log(a - 1)", "10 ** 400", "sqrt(-a)")
 def test_values_must_be_finite(text):
-    with pytest.raises(UserError, match="not finite"):
-        Expression("x", text).evaluate({"a": np.array([1.0, 2.0])})
+    must_refuse("not finite", lambda: Expression("x", text).evaluate({"a": np.array([1.0, 2.0])}))

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 from matplotlib.figure import Figure
 from PIL import Image
-from rows import each_row
+from rows import each_row, must_refuse
 
 from mitransient_lidar import results
 from mitransient_lidar.core.marks import holds_mark, read_mark, write_mark
@@ -96,8 +96,7 @@ def test_checksum_of_a_marked_file_is_checked(tmp_path):
     data = bytearray(path.read_bytes())
     data[-3000] ^= 1
     path.write_bytes(data)
-    with pytest.raises(ValueError, match="SHA-256"):
-        files.check_sum(path)
+    must_refuse("SHA-256", files.check_sum, path)
 
 
 def test_what_is_no_regular_file_has_no_mark(tmp_path):

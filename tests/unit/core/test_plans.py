@@ -98,5 +98,4 @@ def test_options_named_by_their_module_are_checked():
     drawn.__annotations__ = {"seed": "options.Seed", "table": "frames.Table"}
     assert options.checked(drawn)(3, table=4) == 3
     assert "Random seed" in options.checked(drawn).__doc__
-    with pytest.raises(UserError, match="seed = -1 must lie between 0"):
-        options.checked(drawn)(-1)
+    must_refuse("seed = -1 must lie between 0", lambda: options.checked(drawn)(-1))

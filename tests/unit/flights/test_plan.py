@@ -6,10 +6,9 @@ import logging
 import numpy as np
 import pytest
 import xarray as xr
-from rows import each_row, refuses
+from rows import each_row, must_refuse, refuses
 
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.plan import FlightPlan, flights
 from mitransient_lidar.flights.poses.platforms import platform_of
 from mitransient_lidar.flights.preparation import input_columns, warn_of_angles
@@ -95,8 +94,7 @@ def test_systems_of_times(platform, last, system):
 
 def test_times_that_are_not_known():
     message = r"the times of line\.txt, up to 1764000000 s, may be Unix times, which are 315964782 s more"
-    with pytest.raises(UserError, match=message):
-        platform_of(CSV).time_system(np.array([1.764e9 - 10, 1.764e9]))
+    must_refuse(message, lambda: platform_of(CSV).time_system(np.array([1.764e9 - 10, 1.764e9])))
 
 
 def test_pulses_beyond_the_angles_of_corrections_are_counted(caplog):

@@ -50,8 +50,7 @@ def test_the_mesh_of_a_result_is_checked(square):
     digest = hashlib.sha256(square.read_bytes()).hexdigest()
     rows = [{"plugin": "ply", "name": str(square), "path": str(square), "sha256": digest}]
     changed = {**record.attributes(), "scene_files": json.dumps(rows)}
-    with pytest.raises(UserError, match="has a face with the vertex 4"):
-        open_scene(SceneSource.from_attributes(changed))
+    must_refuse("has a face with the vertex 4", lambda: open_scene(SceneSource.from_attributes(changed)))
 
 
 @each_case(

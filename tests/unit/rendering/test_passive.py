@@ -10,7 +10,6 @@ from rows import must_refuse, refuses
 from significance import largest_z
 
 import mitransient_lidar
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering import passive
 from mitransient_lidar.results import save
 from mitransient_lidar.transport.daylight.renderer import DaylightLight, pixel_solid_angles
@@ -93,8 +92,7 @@ def test_smoothed_images_are_those_of_other_passes_with_less_noise():
     assert 0 <= smooth.attrs["smoothing_bias"] < 0.05
     again = mitransient_lidar.render(smooth, passes=2)
     assert again.attrs["smooth_pixels"] == 2.0
-    with pytest.raises(UserError, match="smooth = 1 pixels needs a layout of rows and columns"):
-        render(scene("hex7"), smooth=1.0)
+    must_refuse("smooth = 1 pixels needs a layout of rows and columns", lambda: render(scene("hex7"), smooth=1.0))
 
 
 @pytest.mark.slow

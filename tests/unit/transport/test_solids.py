@@ -4,9 +4,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
-from rows import each_row
+from rows import each_row, must_refuse
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.probe import first_along
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.solids import box_rays
@@ -96,8 +95,7 @@ def test_instance_returns_the_light_of_what_it_repeats(lidar_scene, integrator):
 )
 def test_bsdfs_that_cannot_be_evaluated_are_refused(bsdf, told, lidar_scene):
     scene = lidar_scene(extra={"ball": {"type": "sphere", "radius": 0.1, "bsdf": bsdf}})
-    with pytest.raises(UserError, match=f"shape 'ball'.*{told}"):
-        find_lidar_scene(scene, scene.sensors()[0])
+    must_refuse(f"shape 'ball'.*{told}", lambda: find_lidar_scene(scene, scene.sensors()[0]))
 
 
 def test_rays_meet_every_side_of_a_box():

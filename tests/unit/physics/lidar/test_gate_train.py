@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from oracles.gates import transmission
+from rows import must_refuse
 from scipy.integrate import quad
 from scipy.stats import exponnorm, norm
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateSequence, GateShape, GateTrain
 from mitransient_lidar.physics.lidar.pulse import Pulse
 
@@ -76,8 +76,7 @@ def test_profile_files(tmp_path):
     path.write_text("gate [%]; t [ps]\n0; 0\n100; 1000\n0; 3000\n")
     assert GateShape.from_file(path).width_ns == pytest.approx(1.5)
     path.write_text("1 2 3\n4 5 6\n")
-    with pytest.raises(ValueError, match="line 1: '1 2 3' must be two numbers, time in ns and transmission"):
-        GateShape.from_file(path)
+    must_refuse("line 1: '1 2 3' must be two numbers, time in ns and transmission", GateShape.from_file, path)
 
 
 @pytest.mark.parametrize("shape", [GateShape.edges(7.0), GateShape.edges(7.0, 2.0, 6.0), PROFILE])
@@ -102,8 +101,7 @@ def test_gates_follow_each_other():
         first, weights = train.gate_bins(gate, 1390.0, 0.5, 100)
         assert first == train.gate_bins(0, 1390.0, 0.5, 100)[0] + 5 * gate
         np.testing.assert_allclose(weights, train.gate_bins(0, 1390.0, 0.5, 100)[1], atol=1e-12)
-    with pytest.raises(ValueError, match="gate = 5 must lie between 0 and 4"):
-        train.gate_bins(5, 1390.0, 0.5, 100)
+    must_refuse("gate = 5 must lie between 0 and 4", train.gate_bins, 5, 1390.0, 0.5, 100)
 
 
 @pytest.mark.parametrize("train", [GateTrain(1403.2, 7.0, 3.3, 4, 2.0, 4.0), GateTrain.measured(PROFILE, 1402, 1.7, 6)])
@@ -206,5 +204,4 @@ def test_passes_sample_all_pulses_alike(pulses, passes):
 def test_platform_goes_along_its_heading():
     sequence = GateSequence(1, 1, 1, 1.0, speed=2.0, heading_deg=90.0)
     np.testing.assert_allclose(sequence.displacements(np.array([0.0, 3.0])), [[0, 0], [6, 0]], atol=1e-12)
-    with pytest.raises(UserError, match="pulse_rate_hz = 0 must be greater than 0"):
-        GateSequence(1, 1, 1, 0.0)
+    must_refuse("pulse_rate_hz = 0 must be greater than 0", GateSequence, 1, 1, 1, 0.0)

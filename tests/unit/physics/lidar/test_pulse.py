@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse
 from scipy.integrate import quad
 from scipy.stats import exponnorm, norm
 
@@ -49,8 +49,7 @@ def test_pulse_file_of_an_oscilloscope(tmp_path, caplog):
     np.testing.assert_allclose(pulse.power, [0, 0, 0.5, 0], rtol=1e-12)
     assert caplog.messages == [f"{path}: 1 of 4 samples are below 0, down to -0.013 of the largest one, and set to 0"]
     path.write_text("ns, V\n0, 0\n1, -1\n2, 0.1\n")
-    with pytest.raises(ValueError, match=r"pulse.txt has power = -1 with a largest one of 0.1: samples must not be"):
-        Pulse.from_file(path)
+    must_refuse(r"pulse.txt has power = -1 with a largest one of 0.1: samples must not be", Pulse.from_file, path)
 
 
 @each_row(0.1, 0.5, 5.0, 200.0)

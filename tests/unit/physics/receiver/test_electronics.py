@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse
 from scipy.stats import norm
 from significance import largest_z
 
@@ -152,5 +152,4 @@ def test_samples_fall_on_bins():
     assert Digitiser(8, 1.0, sampling_ghz=0.3).stride(1 / 0.3) == 1
     with pytest.raises(ValueError, match=r"sampling_ghz = 1 must give an integer number of bins of 0.3 ns .* 3.33333"):
         Digitiser(8, 1.0, sampling_ghz=1.0).stride(0.3)
-    with pytest.raises(ValueError, match="sampling_ghz = 2"):
-        Digitiser(8, 1.0, sampling_ghz=2.0).stride(1.0)
+    must_refuse("sampling_ghz = 2", lambda: Digitiser(8, 1.0, sampling_ghz=2.0).stride(1.0))

@@ -112,24 +112,19 @@ def test_invalid_positions_are_rejected(positions, message, tmp_path):
 
 def test_files_without_one_map_are_rejected(tmp_path):
     path = write_npz(tmp_path / "map.npz", depths=HEIGHTS)
-    with pytest.raises(ValueError, match=r"map.npz must have an array heights, and may have x and y"):
-        read_height_map(path)
+    must_refuse(r"map.npz must have an array heights, and may have x and y", read_height_map, path)
     path = write_exr(tmp_path / "map.exr", dict.fromkeys("AB", HEIGHTS.astype(np.float32)))
-    with pytest.raises(ValueError, match="has the channels A, B: it must have only one, or one called Y, R or Z"):
-        read_height_map(path)
+    must_refuse("has the channels A, B: it must have only one, or one called Y, R or Z", read_height_map, path)
     path = write_netcdf(tmp_path / "map.nc", HEIGHTS, name="a", b=(("y", "x"), HEIGHTS))
-    with pytest.raises(ValueError, match="has 2 variables that may be the heights"):
-        read_height_map(path)
+    must_refuse("has 2 variables that may be the heights", read_height_map, path)
     path = write_netcdf(tmp_path / "map.nc", HEIGHTS[0], dims=("x",), name="a")
-    with pytest.raises(ValueError, match="has 0 variables that may be the heights"):
-        read_height_map(path)
+    must_refuse("has 0 variables that may be the heights", read_height_map, path)
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".npz", ".exr", ".nc"])
 def test_missing_and_damaged_files_are_rejected(tmp_path, suffix, capfd):
     path = tmp_path / f"map{suffix}"
-    with pytest.raises(ValueError, match=f"cannot read .*map{suffix}: No such file or directory"):
-        read_height_map(path, 6.0)
+    must_refuse(f"cannot read .*map{suffix}: No such file or directory", read_height_map, path, 6.0)
     writers = {
         ".npy": lambda: write_npy(path, HEIGHTS),
         ".npz": lambda: write_npz(path, heights=HEIGHTS),
@@ -142,8 +137,7 @@ def test_missing_and_damaged_files_are_rejected(tmp_path, suffix, capfd):
     pickled = (tmp_path / "objects.npy").read_bytes()
     for damaged in (content[: len(content) // 2], content[:-20], b"", b"neither of these\n" * 20, pickled):
         path.write_bytes(damaged)
-        with pytest.raises(ValueError, match=f"map{suffix} is damaged, or is not"):
-            read_height_map(path, 6.0)
+        must_refuse(f"map{suffix} is damaged, or is not", read_height_map, path, 6.0)
     # There is no output besides the exception.
     assert capfd.readouterr() == ("", "")
 

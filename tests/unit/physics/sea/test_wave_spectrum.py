@@ -184,8 +184,7 @@ def test_shallow_water_limits_the_long_waves():
 
 def test_jonswap_ends_where_the_sea_is_fully_developed():
     """100 km at 3 m/s would make waves of 0.735 m, three times those of a fully developed sea."""
-    with pytest.raises(ValueError, match=r"fetch = 100000 must not exceed 1\.56e\+04 m .* sea is fully developed"):
-        JonswapSpectrum(3, 1e5)
+    must_refuse(r"fetch = 100000 must not exceed 1\.56e\+04 m .* sea is fully developed", JonswapSpectrum, 3, 1e5)
     oldest = JonswapSpectrum(3, 15.6e3)
     assert oldest.peak_wavenumber == pytest.approx(PiersonMoskowitzSpectrum(3).peak_wavenumber, rel=2e-3)
 

@@ -163,8 +163,7 @@ def test_one_of_several_wavelengths_is_read(tmp_path):
     np.testing.assert_array_equal(read.absorption, [2, 2])
     np.testing.assert_array_equal(read.scattering, [4, 4])
     np.testing.assert_array_equal(read.backscattering, [0.5, 0.5])
-    with pytest.raises(ValueError, match=r"has no columns for 532 nm but must: its wavelengths are 488, 531.5"):
-        read_profile(path, 532.0)
+    must_refuse(r"has no columns for 532 nm but must: its wavelengths are 488, 531.5", read_profile, path, 532.0)
 
 
 def test_units_of_netcdf_variables(tmp_path):
@@ -177,8 +176,7 @@ def test_units_of_netcdf_variables(tmp_path):
     np.testing.assert_allclose(read.depth, [0, 3], rtol=1e-15)
     np.testing.assert_allclose(read.scattering, read.absorption, rtol=1e-15)
     xr.Dataset({**variables, "a": ("depth", values["a"], {"units": "W"})}).to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(ValueError, match=r"water.nc has an unknown unit in column 'a \[W\]'"):
-        read_profile(path)
+    must_refuse(r"water.nc has an unknown unit in column 'a \[W\]'", read_profile, path)
 
 
 @refuses(
@@ -247,13 +245,11 @@ def test_invalid_netcdf_files_are_rejected(tmp_path):
         read_profile(write(depth, a=[0.1, -0.1], b=[0.1, 0.1]))
     with pytest.raises(ValueError, match=r"water.nc has an unknown column 'BX'"):
         read_profile(write(depth, a=[0.1, 0.1], b=[0.1, 0.1], BX=[0.1, 0.1]))
-    with pytest.raises(ValueError, match=r"columns a, b: needed are depth or z and two"):
-        read_profile(write(a=[0.1, 0.1], b=[0.1, 0.1]))
+    must_refuse(r"columns a, b: needed are depth or z and two", read_profile, write(a=[0.1, 0.1], b=[0.1, 0.1]))
     with pytest.raises(ValueError, match=r"water.nc has a of type .*, but it must hold real numbers"):
         read_profile(write(depth, a=["x", "y"], b=[0.1, 0.1]))
     path.write_bytes(b"no NetCDF")
-    with pytest.raises(ValueError, match=r"water.nc is damaged, or is not a NetCDF-4 file"):
-        read_profile(path)
+    must_refuse(r"water.nc is damaged, or is not a NetCDF-4 file", read_profile, path)
 
 
 @refuses(

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import significance
 from oracles.diffuse_attenuation import diffuse_attenuation
-from rows import each_case, each_row
+from rows import each_case, each_row, must_refuse
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.seawater import water_absorption
 from mitransient_lidar.physics.water.water_types import (
     InherentProperties,
@@ -56,8 +55,7 @@ def test_waters_with_particles_in_the_near_infrared(kind, value):
 
 def test_particles_of_no_molecules_stay_without():
     assert near_infrared(InherentProperties(0.15, 0.15, 0.006), 1064.0).water_scattering == 0
-    with pytest.raises(UserError, match="wavelength_nm = 690 must lie between 700 and 1100"):
-        near_infrared(jerlov("II"), 690.0)
+    must_refuse("wavelength_nm = 690 must lie between 700 and 1100", lambda: near_infrared(jerlov("II"), 690.0))
 
 
 @each_row(*JERLOV_KD.items())
