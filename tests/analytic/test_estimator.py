@@ -1,7 +1,6 @@
 """Properties that the estimator must have whatever the scene: sums, reciprocity, strategies that agree, energy."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import drjit as dr
 import numpy as np
@@ -97,22 +96,6 @@ def test_roulette_changes_no_mean(lidar_scene, passes):
 
 
 @pytest.mark.slow
-def test_orders_of_scattering_add_up(lidar_scene, passes):
-    """Same seed: paths are only cut shorter, so each order adds light, and a high limit is none."""
-    energies = [
-        passes(lidar_scene(sea=ROUGH, integrator={"paths_per_pass": 2**13, "max_scatterings": limit}), 1)[0]
-        for limit in (0, 1, 2, 4, 1000, -1)
-    ]
-    for fewer, more in pairwise(energies):
-        assert np.all(more >= fewer * (1 - 1e-12))
-    np.testing.assert_allclose(energies[-2], energies[-1], rtol=1e-12)
-    totals = [energy.sum() for energy in energies]
-    # The water and, in the bottom echo, forward-scattered light: orders 1 and 2 are a large part of the whole.
-    assert totals[1] - totals[0] > 0.2 * totals[-1]
-    assert totals[2] - totals[1] > 0.1 * totals[-1]
-
-
-@pytest.mark.slow
 def test_symbolic_and_evaluated_loops_agree(lidar_scene, passes):
     energies = []
     for symbolic in (True, False):
@@ -121,24 +104,6 @@ def test_symbolic_and_evaluated_loops_agree(lidar_scene, passes):
     # Fused and separate kernels round differently, which now and then moves a path to the next bin.
     assert energies[0].sum() == pytest.approx(energies[1].sum(), rel=1e-3)
     assert np.mean(np.isclose(*energies, rtol=1e-3, atol=1e-24)) > 0.95
-
-
-@pytest.mark.slow
-def test_absorption_multiplies_every_bin_by_its_path_in_the_water(lidar_scene, passes):
-    """Absorption alone, without scattering, leaves the surface echo and dims the bottom by exp(-2 da L)."""
-    bottoms = []
-    for attenuation in (0.1, 0.2):
-        water = {"attenuation": attenuation, "scattering": 0.0, "backscattering": 0.0}
-        # The record ends before light comes that the bottom has reflected twice.
-        film = {"time_start_ns": 1450.0, "bin_count": 60}
-        scene = lidar_scene(water=water, film=film, integrator={"paths_per_pass": 2**13})
-        bottoms.append(passes(scene, 32).sum(axis=(1, 2)))
-    path = 8 / np.cos(np.arcsin(np.sin(np.radians(20)) / 1.34))
-    mean = [b.mean() for b in bottoms]
-    relative = np.hypot(*(b.std(ddof=1) / np.sqrt(32) / b.mean() for b in bottoms))
-    assert relative < 1e-2
-    # Rays of the beam within 5 mrad cross 0.1 % more or less water.
-    assert abs(mean[1] / mean[0] / np.exp(-0.2 * path) - 1) < largest_z(32) * relative + 1e-3
 
 
 @pytest.mark.slow

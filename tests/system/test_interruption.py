@@ -51,18 +51,6 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_on_the_command_line_keeps_the_passes(tmp_path, number, code):
-    process, stdout, stderr = render(INTERRUPTED, tmp_path, passes=100_000, before=[int(number)])
-    assert process.returncode == code, stderr
-    assert "interrupted after 3 passes; their result is kept" in stderr
-    assert names(tmp_path) == FILES
-    assert stdout.splitlines() == [str(tmp_path / name) for name in FILES]
-    attributes = mitransient_lidar.open(tmp_path / "table1.nc").attrs
-    assert (attributes["interrupted"], attributes["passes"]) == (1, 3)
-
-
 @pytest.mark.slow
 def test_a_closed_terminal_keeps_the_passes(tmp_path):
     """The terminal is closed, which sends SIGHUP, and every later output to it fails."""

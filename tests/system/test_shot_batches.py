@@ -16,7 +16,6 @@ from mitransient_lidar.loading import scenes
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotPoses
-from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.studies import shots
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes
@@ -181,21 +180,6 @@ def test_a_level_scene_is_the_same_everywhere(integrator):
     # Paths are the same but for roundings: few are deflected otherwise. The offset had moved the bottom by 0.2 ns.
     np.testing.assert_allclose(centre, centre[0], atol=0.02)
     np.testing.assert_allclose(total, total[0], rtol=1e-3)
-
-
-@pytest.mark.long
-def test_target_goes_with_the_shots():
-    """On a level sea all shots are the same, those with a target that goes with them too, by origin."""
-    params = {"spectrum": "flat", "target_depth": 5, "target_x": 0.4, "layout": "2x2"}
-    options = {"passes": 4, "pass_share": 0.05, "components": True}
-    series = render_shots("fig13_2x2", params, positions=np.repeat(PLACES, 8, axis=0), move_target=True, **options)
-    assert list(series["origin"].values) == ["surface", "water", "target", "bottom"]
-    assert series["waveform_by_origin"].dims == ("shot", "origin", "pixel", "time")
-    for name in ("impulse_response", "waveform"):
-        np.testing.assert_array_equal(series[f"{name}_by_origin"].sum("origin"), series[name])
-    energy = series["impulse_response_by_origin"].sum(["pixel", "time"]).values.reshape(len(PLACES), 8, 4)
-    for place in energy[1:]:
-        assert_same(place, energy[0], error=0.03, known=0.15)
 
 
 WAVES = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15}

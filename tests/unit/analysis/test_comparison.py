@@ -93,20 +93,6 @@ def test_results_that_cannot_be_compared_are_rejected():
     must_refuse("share no bin", comparison.compare, unknown, result(2))
 
 
-@pytest.mark.slow
-def test_command_draws_and_answers(tmp_path):
-    for name, factor, seed in (("a", 1.0, 1), ("b", 1.0, 2), ("c", 1.2, 3)):
-        results.save(result(seed, factor=factor), tmp_path / f"{name}.nc")
-    same = run("compare", tmp_path / "a.nc", tmp_path / "b.nc")
-    assert same.exit_code == 0, same.output
-    assert same.stdout.splitlines()[0] == str(tmp_path / "a_b.png")
-    assert same.stdout.splitlines()[1].startswith("agree: 200 bins")
-    other = run("compare", tmp_path / "a.nc", tmp_path / "c.nc", "-o", tmp_path / "d.svg")
-    assert other.exit_code == 1
-    assert "differ" in other.stdout
-    assert "<!-- (standard errors) -->" in (tmp_path / "d.svg").read_text()
-
-
 def test_gates_alone_are_compared(tmp_path):
     """The same pixels and gates of other passes agree, and 3 % more light does not; with bins beside, too."""
 

@@ -1,7 +1,6 @@
 """The intercomparison: its table against its scenes, the score's arithmetic, and single scattering in closed form."""
 
 import importlib.util
-import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -112,14 +111,15 @@ def test_score_of_known_differences():
     ("gate_start_ns,gate_end_ns,energy_j,stderr_j\n0,1,word,1\n", "word"),
     ("gate_start_ns,gate_end_ns,energy_j,stderr_j\n0,1,1,1\n", "gates must be those of cases.csv"),
 )
-def test_a_wrong_submission_is_refused_in_one_sentence(text, message, tmp_path):
+def test_a_wrong_submission_is_refused_in_one_sentence(text, message, tmp_path, monkeypatch, capsys):
     (tmp_path / "single_scattering.csv").write_text(text)
-    ran = subprocess.run([sys.executable, FOLDER / "score.py", tmp_path], capture_output=True, text=True, check=False)
-    assert ran.returncode == 2
-    assert ran.stdout == ""
-    assert ran.stderr.startswith("error: ")
-    assert message in ran.stderr
-    assert len(ran.stderr.splitlines()) == 1
+    monkeypatch.setattr(sys, "argv", ["score.py", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        score.main()
+    out, err = capsys.readouterr()
+    assert (ended.value.code, out, len(err.splitlines())) == (2, "", 1)
+    assert err.startswith("error: ")
+    assert message in err
     assert not (tmp_path / "score.png").exists()
 
 

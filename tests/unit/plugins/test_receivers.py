@@ -75,29 +75,6 @@ def test_stratified_points_cover_the_square_evenly(count):
     assert np.abs(counts - count / 256).max() < 2 if count == 5000 else counts.std() == 0
 
 
-@pytest.mark.slow
-def test_imager_rows_go_from_far_to_near_and_columns_from_left_to_right(lidar_scene, passes):
-    """A beam aimed 1.5 m towards +y, as seen 200 m away, lights the left columns, near rows first."""
-    scene = lidar_scene(
-        tx={"aim_y": 1.5},
-        rx={"layout": "4x6", "field_of_view_shape": "square"},
-        sea={"slope_variance": "0.02"},
-        water={"attenuation": 50.0, "scattering": 0.0, "backscattering": 0.0},
-        film={"bin_width_ns": 0.5, "bin_count": 120},
-        bottom=None,
-    )
-    energy = passes(scene, 4).mean(axis=0)
-    assert energy.shape == (4, 6, 120)
-    assert np.array(mi.render(scene)).shape == (4, 6, 120)
-    columns = energy.sum(axis=(0, 2))
-    # 1.5 m at a range of 212.8 m are 7 mrad: in the second of the six columns of 5 mrad.
-    assert np.argmax(columns) == 1
-    ticks = np.arange(120)
-    arrival = [(energy[row].sum(axis=0) * ticks).sum() / energy[row].sum() for row in range(4)]
-    # 7.5 mrad a row are 3.9 ns, 7.7 bins.
-    assert np.all(np.diff(arrival) < -4)
-
-
 def test_foreign_integrators_are_refused():
     with pytest.raises(UserError, match="use the integrator lidar_merging or lidar_volpath"):
         mi.load_dict({"type": "time_gated_film"}).create_block()

@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import run
 from rows import each_case, each_row, must_refuse
 
 from mitransient_lidar import results
@@ -238,25 +237,6 @@ def test_an_interruption_of_the_first_of_two_channels_ends_the_render(module, na
     with pytest.raises(KeyboardInterrupt):
         function(**{"result": xr.Dataset()} if name == "render_again" else of_scene)
     assert calls == [called]
-
-
-@pytest.mark.slow
-def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, tmp_path):
-    whole = shot_batches.ShotBatches.render
-
-    def interrupted(batches, poses, seeds):
-        if seeds[0] == 1:
-            raise KeyboardInterrupt
-        return whole(batches, poses, seeds)
-
-    monkeypatch.setattr(shot_batches.ShotBatches, "render", interrupted)
-    (tmp_path / "places.csv").write_text("x,y\n1,2\n3,4  # the last\n")
-    arguments = ["-D", "spectrum=flat", "--places", tmp_path / "places.csv", "-o", tmp_path / "new" / "shots.nc"]
-    done = run("shots", "fig09_2x2", *arguments)
-    assert done.exit_code == 130
-    assert done.stdout.splitlines()[0] == str(tmp_path / "new" / "shots.nc")
-    assert done.stderr.splitlines()[-1] == "interrupted after 1 of the shots; their result is kept"
-    assert results.open(tmp_path / "new" / "shots.nc")["aim_y"].values.tolist() == [2.0]
 
 
 @each_case(

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import assert_refused, run
 from rows import must_refuse, refuses
 from scipy.stats import truncnorm
 from synthetic_shots import (
@@ -30,7 +29,6 @@ from synthetic_shots import (
     waveform,
 )
 
-from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieval_table, retrieve, surface_inputs
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.studies import shots as retrieval
@@ -228,22 +226,6 @@ def test_estimates_without_a_column(caplog):
 def test_no_estimate():
     with pytest.raises(UserError, match="nothing can be estimated: no waveform has a surface echo"):
         retrieve.retrieve(result(np.full((4, BINS), 1e-12)))
-
-
-@pytest.mark.slow
-def test_command(tmp_path):
-    results.save(result(), tmp_path / "shot.nc")
-    written = tmp_path / "out" / "found.nc"
-    done = run("retrieve", tmp_path / "shot.nc", "-o", written, "--slope-deviation", "0.1,0.1")
-    assert done.exit_code == 0, done.output
-    for text in ("slope along: ", "bottom depth: 8.0", "bright 100", "water (1/m): a 0.1", "attenuation (1/m): c "):
-        assert text in done.output
-    expected = retrieve.retrieve(results.open(tmp_path / "shot.nc"), slope_deviation=(0.1, 0.1))
-    xr.testing.assert_allclose(xr.load_dataset(written, engine="h5netcdf"), expected)
-    results.save(result(field_of_view_mrad=20.0), tmp_path / "narrow.nc")
-    assert "too narrow" in run("retrieve", tmp_path / "narrow.nc").output
-    refused = run("retrieve", tmp_path / "shot.nc", "--slope-deviation", "0.1")
-    assert_refused(refused, "--slope-deviation = '0.1' must be two numbers")
 
 
 @pytest.fixture
