@@ -57,9 +57,6 @@ def test_only_what_is_not_merged_is_left_to_the_reference(lidar_scene, passes):
     assert passes(mirror, 2).sum() > 0
 
 
-# Statistics.
-
-
 @pytest.mark.slow
 def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
     four = passes(lidar_scene(integrator=FEW, sea=WAVES), 2, 5)
@@ -68,9 +65,6 @@ def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
     single = passes(lidar_scene(integrator=FEW, sea=WAVES, rx={"layout": "1x1"}), 2, 5)
     np.testing.assert_allclose(four.sum(axis=1), single[:, 0], rtol=1e-12, atol=1e-30)
     assert not np.array_equal(four[0], four[1])
-
-
-# Parts.
 
 
 @pytest.fixture

@@ -68,9 +68,6 @@ def agrees(samples, expected, comparisons=1, bias=0.0):
     return error / expected
 
 
-# (a) a white plate just below the surface
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("zenith", "off_nadir", "rho"), [(0.0, 15.0, 0.9), (40.0, 35.0, 0.9)])
 def test_a_plate_just_below_the_surface(zenith, off_nadir, rho):
@@ -134,9 +131,6 @@ def crossing(bsdf, side, off_normal_deg):
     return energy[reflected].sum() / energy.size, energy[~reflected].sum() / energy.size
 
 
-# (c) sun glint
-
-
 @pytest.mark.slow
 @each_case((30.0, 180.0, 20.0, 6.0, 0.0), (35.0, 10.0, 30.0, 4.0, 90.0))
 def test_sun_glint_of_gaussian_slopes(zenith, azimuth, view, wind, wind_azimuth):
@@ -172,9 +166,6 @@ def direction(zenith, azimuth):
     return np.array([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
 
 
-# (d) the sky's mirror image
-
-
 @pytest.mark.parametrize("view", [0.0, 70.0])
 def test_a_level_sea_mirrors_the_sky(view):
     """Fresnel's reflectance times the sky's radiance; 53 degrees is Brewster's angle, far below 4 times 2 %."""
@@ -199,8 +190,6 @@ def test_a_level_sea_mirrors_the_sky_where_it_is_seen():
         radiance = float(next(e for e in scene.emitters() if hasattr(e, "sun")).radiance(mirrored)[0])
         agrees(passes(scene, 4), float(fresnel(view, N)[0]) * radiance, 2, bias=2e-3)
 
-
-# (b) deep water
 
 WATER = {"attenuation": 1.0, "scattering": 0.9, "backscattering": 0.9 * 0.0183}
 
@@ -276,6 +265,3 @@ def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
         found.append([float(record.found[0])])
     error = agrees(np.array(found), expected, 4, bias=spread)
     assert error < largest_error(8, 0.004 if ratio > 0.1 else 0.018)
-
-
-# (e) waves focus the sun

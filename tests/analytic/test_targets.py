@@ -40,9 +40,6 @@ def plate(x, y, z, half, bsdf, tilt=0.0):
     return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
 
 
-# Closed forms.
-
-
 def gain(x, y, z, lidar=LIDAR, sigma=SIGMA):
     """Return what the lidar makes of a small target at (x, y, z) in still, clear water.
 
@@ -211,9 +208,6 @@ def test_opposition_effect_brightens_a_level_bottom(lidar_scene, passes, integra
     # Slopes of 0.003 turn light and view 0.001 rad apart, 0.1 % of the peak's height, and the beam is 0.008 rad wide.
     assert abs(ratio - expected) < largest_z(16) * error + 2e-3 * expected
     assert expected > 1.5
-
-
-# Published figures 13 and 14.
 
 
 @pytest.mark.slow

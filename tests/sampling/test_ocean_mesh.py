@@ -121,9 +121,6 @@ def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, tota
         assert parameters[f"bsdf.alpha_{axis}.value"][0] == pytest.approx(np.sqrt(2 * variance), rel=1e-6)
 
 
-# The patch and what surrounds it.
-
-
 @pytest.mark.slow
 def test_cells_are_chosen_by_footprint_and_range():
     """A twelfth of the beam's standard deviation: 1.06 m at 200 m and 20 degrees."""

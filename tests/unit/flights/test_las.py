@@ -84,9 +84,6 @@ def read_column(file: las_reader.LasFile, name: str) -> np.ndarray:
     return np.array([point.extra.get(name, getattr(point, name, None)) for point in file.points])
 
 
-# Points
-
-
 @pytest.mark.parametrize("point_format", [6, 9])
 def test_read_from_the_specification(
     tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset, point_format: int
@@ -204,9 +201,6 @@ def test_coordinate_system_by_code(crs, tmp_path, points):
     assert pyproj.CRS.from_wkt(record.rstrip(b"\0").decode()).equals(pyproj.CRS(crs), ignore_axis_order=True)
 
 
-# Coordinate systems
-
-
 @pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:2263", "EPSG:4978", "EPSG:99999999", "somewhere"])
 def test_unsuitable_coordinate_systems(tmp_path: Path, points: xr.Dataset, crs: str) -> None:
     with pytest.raises(UserError, match=rf"^crs = '{re.escape(crs)}' .*(EPSG:32633|must be projected)"):
@@ -220,9 +214,6 @@ def test_web_mercator_is_refused_where_its_metres_are_not_those_on_the_ground(tm
     with pytest.raises(UserError, match=r"crs = 'EPSG:3857' has coordinates in .*Mercator, .* are 1\.887 times"):
         write_points(tmp_path / "points.las", moved, "EPSG:3857")
     assert not any(tmp_path.iterdir())
-
-
-# Waveforms
 
 
 def test_packets(tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset) -> None:
@@ -313,9 +304,6 @@ def test_samples_lie_on_the_refracted_ray(tmp_path: Path, points: xr.Dataset, wa
     # The vectors point up to the lidar: the first sample is above the sea, the last one below the bottom.
     assert las_reader.sample_position(returns, 0)[2] > 2
     assert las_reader.sample_position(returns, 1e3 * (lead_ns + water_ns + 10))[2] < -depth - 0.5
-
-
-# Wrong input
 
 
 @each_case(
