@@ -27,7 +27,7 @@ from mitransient_lidar.campaigns.versions import FILES, check_versions
 
 
 @pytest.mark.slow
-def test_same_bits_whatever_shards_workers_order_and_interruptions(campaign, quick, tmp_path, request):
+def test_same_bits_whatever_shards_workers_order_and_interruptions(campaign, quick, tmp_path, request, default_ctrl_c):
     """Ctrl-C comes when three runs are done; processes write what they have, and this process renders the others."""
     path, pressed = tmp_path / "other.zarr", []
 
@@ -36,10 +36,8 @@ def test_same_bits_whatever_shards_workers_order_and_interruptions(campaign, qui
             pressed.append(state.done)
             os.kill(os.getpid(), signal.SIGINT)
 
-    former = signal.signal(signal.SIGINT, signal.default_int_handler)
     with pytest.raises(KeyboardInterrupt, match=r"interrupted after \d+ of 12 runs, which are kept; the same command"):
         run_campaign(campaign, path, workers=2, shard_size=5, progress=press)
-    signal.signal(signal.SIGINT, former)
     assert np.count_nonzero(Store(path).status() == DONE) >= 3
     request.getfixturevalue("in_this_process")
     first, other = open_campaign(quick), resume(path, workers=1)

@@ -114,14 +114,6 @@ def test_stops_at_the_target_or_the_time_and_reports_progress():
     assert time.perf_counter() - start < 30
 
 
-@pytest.fixture
-def default_ctrl_c():
-    """Python's own handler: a shell that starts the tests in the background leaves Ctrl-C ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.slow
 def test_ctrl_c_during_a_pass_keeps_what_was_rendered(default_ctrl_c, monkeypatch):
     """Dr.Jit turns an exception inside a loop that it records into a RuntimeError."""

@@ -130,8 +130,7 @@ def test_a_disk_without_space_for_the_last_picture_leaves_the_former_files(scene
     assert [(path.name, path.read_text()) for path in tmp_path.glob("fig09*")] == [("fig09_layout.png", "old")]
 
 
-def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tmp_path, monkeypatch):
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tmp_path, monkeypatch, default_ctrl_c):
     save = results.save
 
     def interrupted(dataset, path):
@@ -140,10 +139,7 @@ def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tm
         save(dataset, path)
 
     monkeypatch.setattr(results, "save", interrupted)
-    try:
-        result = run("render", scene, "-o", tmp_path / "out", "--quiet", "--no-plot")
-    finally:
-        signal.signal(signal.SIGINT, before)
+    result = run("render", scene, "-o", tmp_path / "out", "--quiet", "--no-plot")
     assert result.exit_code == 130
     assert results.open(tmp_path / "out" / "fig09.nc").attrs["passes"] == 4
     assert (tmp_path / "out" / "fig09.exr").exists()

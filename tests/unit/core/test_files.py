@@ -161,14 +161,6 @@ def test_leftovers_of_another_user_stay(tmp_path, dead, monkeypatch):
     assert contents(tmp_path) == {name: "theirs", "c": "new"}
 
 
-@pytest.fixture
-def default_ctrl_c():
-    """Python's own handler: a shell that starts the tests in the background leaves Ctrl-C ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.parametrize("presses", [1, 2])
 def test_an_interruption_waits_until_the_files_are_in_place(tmp_path, default_ctrl_c, presses):
     (tmp_path / "a").write_text("old")

@@ -109,7 +109,7 @@ def test_the_progress_line_names_the_request_and_its_forecast():
 
 
 @pytest.mark.parametrize(("at", "kept"), [(2, False), (4, True)])
-def test_an_interruption_waits_for_its_pass_alone(monkeypatch, at, kept):
+def test_an_interruption_waits_for_its_pass_alone(monkeypatch, default_ctrl_c, at, kept):
     clock = Clock(monkeypatch, 1.0)
 
     def render_pass(number, seed):
@@ -117,12 +117,8 @@ def test_an_interruption_waits_for_its_pass_alone(monkeypatch, at, kept):
             signal.raise_signal(signal.SIGINT)
         return clock.render_pass(number, seed)
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with contextlib.nullcontext() if kept else pytest.raises(KeyboardInterrupt):
-            assert run_passes(render_pass, Goal(passes=9), seed=0, smallest=3).interrupted
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with contextlib.nullcontext() if kept else pytest.raises(KeyboardInterrupt):
+        assert run_passes(render_pass, Goal(passes=9), seed=0, smallest=3).interrupted
     assert clock.passes == at
 
 
