@@ -53,15 +53,8 @@ CASES = {
 #: Passes, and paths of a pass, of both integrators.
 SAMPLES = {"lidar_merging": (12, 2**13), "lidar_volpath": (16, 2**16)}
 #: Smaller one of two steps over the value, by parameter; those of all reflectances are alike.
-STEPS = {
-    "attenuation": 0.004,
-    "scattering": 0.04,
-    "backscattering": 0.1,
-    "phase_g": 0.05,
-    "divergence_mrad": 0.05,
-    "ripple_variance": 0.05,
-    "reflectance": 0.2,
-}
+STEPS = {"attenuation": 0.004, "scattering": 0.04, "backscattering": 0.1, "phase_g": 0.05, "divergence_mrad": 0.05}
+STEPS |= {"ripple_variance": 0.05, "reflectance": 0.2}
 #: Longer ones where the difference is noisy: free flights follow from the attenuation, and other cells from the beam.
 LONG_STEPS = {("lidar_volpath", "attenuation"): 0.04, ("lidar_merging", "divergence_mrad"): 0.1}
 #: Places of renders, in steps, and their weights in a difference of fourth order.

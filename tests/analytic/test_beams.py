@@ -70,12 +70,8 @@ def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, t
     if kind == "image":
         transmitter, density, half = image_parameters(tmp_path), cells, 2.5e-3
     else:
-        transmitter = {
-            "beam_profile": kind,
-            "divergence_mrad": 12.0,
-            "divergence_across_mrad": 3.0,
-            "ellipse_deg": 30.0,
-        }
+        transmitter = {"beam_profile": kind, "divergence_mrad": 12.0, "divergence_across_mrad": 3.0}
+        transmitter |= {"ellipse_deg": 30.0}
         density, half = ellipse(6e-3, 1.5e-3, np.radians(30), kind == "top_hat"), 3e-3
     scene = lidar_scene(
         tx=transmitter,

@@ -266,12 +266,8 @@ def test_passes_share_their_kernels(lidar_scene, integrator):
 #: Water of two refractive indices.
 STRATA = {"layer_tops": "0, 2", "attenuation": "0.6, 0.3", "scattering": "0.35, 0.15", "backscattering": "0.007, 0.003"}
 STRATA |= {"refractive_index": "1.337, 1.342", "group_index": "1.358, 1.365"}
-OTHER_STRATA = {
-    "layer_tops": "0, 3",
-    "attenuation": "0.5, 0.3",
-    "refractive_index": "1.33, 1.34",
-    "group_index": "1.35, 1.37",
-}
+OTHER_STRATA = {"layer_tops": "0, 3", "attenuation": "0.5, 0.3", "refractive_index": "1.33, 1.34"}
+OTHER_STRATA |= {"group_index": "1.35, 1.37"}
 OTHER_STRATA |= {"plume_scattering": 0.7, "plume_width": 6, "plume_depth": 1.5, "ship_x": 1}
 
 

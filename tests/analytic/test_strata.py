@@ -123,12 +123,8 @@ def test_layers_of_one_water_are_that_water(lidar_scene, passes, integrator):
     sea = {"spectrum": "elfouhaily", "size": 60.0, "cell_size": 0.5}
 
     def record(layer_tops, attenuation="0.9", scattering=0.7):
-        water = {
-            "layer_tops": layer_tops,
-            "attenuation": attenuation,
-            "scattering": scattering,
-            "backscattering": 0.014,
-        }
+        water = {"layer_tops": layer_tops, "attenuation": attenuation, "scattering": scattering}
+        water |= {"backscattering": 0.014}
         engine = {"type": integrator, "paths_per_pass": 2**12}
         if integrator == "lidar_merging":
             engine["photons_per_pass"] = 2**12

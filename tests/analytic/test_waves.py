@@ -22,14 +22,8 @@ def surface_echoes(wind, angle, wave):
     film = {"type": "time_gated_film", "time_start_ns": 12000.0, "bin_width_ns": 6000.0, "bin_count": 1}
     energies = []
     for seed in range(SEAS):
-        sea = {
-            "type": "ocean_surface",
-            "wind_speed": wind,
-            "cell_size": 0.25,
-            "shortest_wave": wave,
-            "refined_size": 96.0,
-            "surface_seed": seed,
-        }
+        sea = {"type": "ocean_surface", "wind_speed": wind, "cell_size": 0.25, "shortest_wave": wave}
+        sea |= {"refined_size": 96.0, "surface_seed": seed}
         scene = mi.load_dict(
             {
                 "type": "scene",

@@ -179,14 +179,8 @@ def test_time_moves_the_sea_downwind():
 @pytest.mark.slow
 def test_any_mesh_with_water_below_it_is_a_sea(lidar_scene, passes, tmp_path):
     """The sea written to a PLY file and read by Mitsuba's plugin: the same paths, the same energies."""
-    sea = {
-        "ripple_focusing": False,
-        "spectrum": "elfouhaily",
-        "slope_variance": "cox_munk",
-        "refined_size": 16.0,
-        "cell_size": 0.25,
-        "size": 100.0,
-    }
+    sea = {"ripple_focusing": False, "spectrum": "elfouhaily", "slope_variance": "cox_munk", "refined_size": 16.0}
+    sea |= {"cell_size": 0.25, "size": 100.0}
     own = lidar_scene(sea=sea, integrator={"paths_per_pass": 2**14})
     shape = next(shape for shape in own.shapes() if hasattr(shape, "sea"))
     shape.write_ply(str(tmp_path / "sea.ply"))

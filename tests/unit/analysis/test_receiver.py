@@ -300,7 +300,7 @@ def changed(value):
     return dataset
 
 
-REFUSED = [
+@refuses(
     (lambda: detect_waveforms(make().drop_vars("waveform"), CHAIN), "another dataset, but must have waveforms"),
     (lambda: detect_waveforms(make().transpose("time", "pixel"), CHAIN), r"dimensions \('time', 'pixel'\)"),
     (lambda: detect_waveforms(make().drop_vars("time"), CHAIN), "no coordinate time"),
@@ -325,10 +325,7 @@ REFUSED = [
             (replace(CHAIN, digitiser=Digitiser(8, 1.0, 0.0, 0.8)), {}, "sampling_ghz = 0.8"),
         )
     ),
-]
-
-
-@refuses(*REFUSED)
+)
 def test_invalid_input(call):
     call()
 

@@ -128,14 +128,7 @@ def test_text_equals_the_file_with_its_includes(name):
 def test_all_parameters_but_texts_have_a_unit():
     own = {name for scene in SHIPPED for name in read_document(catalogue.scene_path(scene)).parameters}
     assert {name for name in own if unit_of(name) is None} == {"layout"}
-    given = {
-        "bottom_depth": "m",
-        "surface_time": "s",
-        "sea.slope_x_deg": "degree",
-        "gate_width_ns": "ns",
-        "plume_width": "m",
-        "sphere_reflectance": "1",
-        "kd": "1/m",
-    }
+    given = {"bottom_depth": "m", "surface_time": "s", "sea.slope_x_deg": "degree", "gate_width_ns": "ns"}
+    given |= {"plume_width": "m", "sphere_reflectance": "1", "kd": "1/m"}
     assert {name: unit_of(name) for name in given} == given
     assert unit_of("my_parameter") is None

@@ -11,15 +11,8 @@ from mitransient_lidar.loading.parameters import fill, value_of, with_value
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.water.water_types import water_of
 
-PARAMETERS = {
-    "layer_tops": "0, 3",
-    "attenuation": "0.9, 0.5",
-    "scattering": "0.25",
-    "bottom_depth": "8",
-    "layout": "2x2",
-    "jerlov": "",
-    "altitude": "nan",
-}
+PARAMETERS = {"layer_tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.25", "bottom_depth": "8"}
+PARAMETERS |= {"layout": "2x2", "jerlov": "", "altitude": "nan"}
 
 
 @each_row(

@@ -142,8 +142,6 @@ def test_fill_factor_keeps_the_pitch():
 
 @each_row(
     ({"layout": "4x4", "field_of_view_mrad": 3.0}, "field_of_view_mrad = 3"),
-    ({"layout": "4x4", "pixel_pitch_um": 0.0}, "pixel_pitch_um = 0"),
-    ({"layout": "4x4", "focal_length_mm": -1.0}, "focal_length_mm = -1"),
     ({"layout": "hex7"}, "focal_length_mm = 100"),
 )
 def test_lenses_that_cannot_be(parameters, words):

@@ -208,7 +208,9 @@ LAYERED = {
 #: A trough of 0.6 m above the lidar.
 HIGH_WAVES = {"type": "ocean_surface", "spectrum": "pierson_moskowitz", "wind_speed": 15.0}
 HIGH_WAVES["interior"] = {"type": "layered_water"}
-WRONG_SCENES = [
+
+
+@refuses(
     ({"rx": {"type": "perspective"}}, "multipixel_receiver or pixel_fov"),
     ({"rx": {"type": "multipixel_receiver"}}, "time_gated_film"),
     ({"tx": {"type": "constant"}}, "exactly one lidar_transmitter"),
@@ -221,10 +223,7 @@ WRONG_SCENES = [
     ({"tx": {"type": "lidar_transmitter", "altitude": -3.0}}, r"at z = -3 m and 200 m must both be above the mean sea"),
     ({**UNDER_WATER, "sea": LAYERED}, "refractive_index changes with depth: a lidar under water needs one index"),
     ({**UNDER_WATER, "sea": HIGH_WAVES}, r"altitude = -0.2 must be below the surface of the waves, whose lowest"),
-]
-
-
-@refuses(*WRONG_SCENES)
+)
 def test_scenes_that_are_no_lidar_scenes_are_refused(parts):
     loaded = scene(**parts)
     find_lidar_scene(loaded, loaded.sensors()[0])

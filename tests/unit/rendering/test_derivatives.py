@@ -12,13 +12,8 @@ from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_L
 from mitransient_lidar.rendering.derivatives import path_parameters
 
 FEW = {"type": "lidar_merging", "paths_per_pass": 1024, "photons_per_pass": 1024}
-LAYERS = {
-    "layer_tops": "0, 3",
-    "attenuation": "0.5, 0.3",
-    "scattering": "0.3, 0",
-    "backscattering": "0.01, 0",
-    "spectrum": "flat",
-}
+LAYERS = {"layer_tops": "0, 3", "attenuation": "0.5, 0.3", "scattering": "0.3, 0", "backscattering": "0.01, 0"}
+LAYERS |= {"spectrum": "flat"}
 
 
 @pytest.fixture(scope="module")

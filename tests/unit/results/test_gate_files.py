@@ -12,17 +12,8 @@ from mitransient_lidar import results
 from mitransient_lidar.results import exr, files
 from mitransient_lidar.results.gate_stack import check_stack
 
-ATTRIBUTES = {
-    "scene": "mine field",
-    "seed": 2**40,
-    "gate_rise_ns": 0.1,
-    "gate_step_ns": 5.0,
-    "pulses": 100,
-    "nothing": [],
-    "one": [1.5],
-    "names": ["rød", ""],
-    "surface_time_ns": 1420.0625,
-}
+ATTRIBUTES = {"scene": "mine field", "seed": 2**40, "gate_rise_ns": 0.1, "gate_step_ns": 5.0, "pulses": 100}
+ATTRIBUTES |= {"nothing": [], "one": [1.5], "names": ["rød", ""], "surface_time_ns": 1420.0625}
 
 
 def make(rows=4, columns=5, gates=3, attributes=ATTRIBUTES, seed=7):

@@ -19,15 +19,8 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import gate_stack
 
 START, WIDTH, BINS = 1400.0, 0.5, 240
-GEOMETRY = {
-    "scene": "fig09",
-    "altitude": 200.0,
-    "surface_time_ns": 1420.0,
-    "refractive_index": 1.34,
-    "group_index": 1.364,
-    "off_nadir_deg": 20.0,
-    "passes": 16,
-}
+GEOMETRY = {"scene": "fig09", "altitude": 200.0, "surface_time_ns": 1420.0, "refractive_index": 1.34}
+GEOMETRY |= {"group_index": 1.364, "off_nadir_deg": 20.0, "passes": 16}
 
 
 def power(t):
