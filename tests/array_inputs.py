@@ -7,16 +7,22 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
+import h5py
 import numpy as np
+import OpenEXR
+import pyproj
+import rasterio
+import xarray as xr
+
+from mitransient_lidar.loading import variants
+from mitransient_lidar.physics.sea.height_maps import read_height_map
+from mitransient_lidar.transport.sensor import image_sampling
 
 _HEIGHTS = 0.1 * np.sin(np.arange(24.0))[:, None] * np.ones(20)
 
 
 def write_bag(path: Path, heights: Any, first: tuple[float, float], cell: tuple[float, float], **changes: Any) -> Path:
     """Write a Bathymetric Attributed Grid from its south-western cell on; `changes` are parts of its metadata."""
-    import h5py
-    import pyproj
-
     rows, columns = np.shape(heights)
     last = (first[0] + (columns - 1) * cell[0], first[1] + (rows - 1) * cell[1])
     corners = changes.get("corners", f"{first[0]!r},{first[1]!r} {last[0]!r},{last[1]!r}")
@@ -52,13 +58,7 @@ def write_bag(path: Path, heights: Any, first: tuple[float, float], cell: tuple[
 
 
 def height_map(suffix: str) -> Callable[[Path], Path]:
-    """Return what writes a height map."""
-
     def make(folder: Path) -> Path:
-        import OpenEXR
-        import rasterio
-        import xarray as xr
-
         path = folder / f"map{suffix}"
         positions = {"x": np.arange(20.0), "y": np.arange(24.0)}
         if suffix == ".npy":
@@ -91,20 +91,13 @@ def height_map(suffix: str) -> Callable[[Path], Path]:
 
 
 def load_map(path: Path) -> None:
-    """Read a height map."""
-    from mitransient_lidar.physics.sea.height_maps import read_height_map
-
     holes = "fill" if path.suffix == ".xyz" else "refuse"
     read_height_map(path, size=20.0 if path.suffix in (".npy", ".exr") else None, holes=holes)
 
 
 def image(suffix: str) -> Callable[[Path], Path]:
-    """Return what writes a grey image."""
-
     def make(folder: Path) -> Path:
         import mitsuba as mi
-
-        from mitransient_lidar.loading import variants
 
         path = folder / f"image{suffix}"
         values = np.arange(1, 64, dtype=np.uint8).reshape(7, 9)
@@ -120,10 +113,7 @@ def image(suffix: str) -> Callable[[Path], Path]:
 
 
 def read_image(path: Path) -> None:
-    """Read a grey image."""
-    from mitransient_lidar.transport.sensor.image_sampling import read_image as read
-
-    read("pixel_map", str(path))
+    image_sampling.read_image("pixel_map", str(path))
 
 
 def mesh(name: str) -> Callable[[Path], Path]:

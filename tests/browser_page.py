@@ -161,15 +161,8 @@ def scene_of(size, gates=40, seed=3):
         "angle_x": (("row", "column"), angle_x, {"units": "mrad"}),
         "angle_y": (("row", "column"), angle_y, {"units": "mrad"}),
     }
-    attributes = {
-        "scene": "sphere & <b>plate",
-        "note": "</script><script>document.title = 'broken'</script>",
-        "altitude": 200.0,
-        "off_nadir_deg": 20.0,
-        "pulses": 1,
-        "surface_time_ns": SURFACE_NS,
-        "seed": seed,
-    }
+    attributes = {"scene": "sphere & <b>plate", "note": "</script><script>document.title = 'broken'</script>"}
+    attributes |= {"altitude": 200.0, "off_nadir_deg": 20.0, "pulses": 1, "surface_time_ns": SURFACE_NS, "seed": seed}
     gate_coords = {
         "gate": np.arange(gates),
         "gate_start": ("gate", start),
@@ -189,5 +182,4 @@ def scene_of(size, gates=40, seed=3):
 
 
 def point_at(page, pixel, **how):
-    """Move the mouse to a pixel, and click there."""
     page.point("pixels", (pixel[1] + 0.5) / SIZE, (pixel[0] + 0.5) / SIZE, **how)

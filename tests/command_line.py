@@ -26,7 +26,6 @@ def run(*arguments):
 
 
 def stub(monkeypatch, command, function):
-    """Replace the function that a command calls, and keep its options."""
     MADE[command].params  # noqa: B018 (reads the signature)
     place, _, name = COMMANDS[command].function.partition(":")
     monkeypatch.setattr(f"mitransient_lidar.{place}.{name}", function)

@@ -53,15 +53,8 @@ CASES = {
 #: Passes, and paths of a pass, of both integrators.
 SAMPLES = {"lidar_merging": (12, 2**13), "lidar_volpath": (16, 2**16)}
 #: Smaller one of two steps over the value, by parameter; those of all reflectances are alike.
-STEPS = {
-    "attenuation": 0.004,
-    "scattering": 0.04,
-    "backscattering": 0.1,
-    "phase_g": 0.05,
-    "divergence_mrad": 0.05,
-    "ripple_variance": 0.05,
-    "reflectance": 0.2,
-}
+STEPS = {"attenuation": 0.004, "scattering": 0.04, "backscattering": 0.1, "phase_g": 0.05, "divergence_mrad": 0.05}
+STEPS |= {"ripple_variance": 0.05, "reflectance": 0.2}
 #: Longer ones where the difference is noisy: free flights follow from the attenuation, and other cells from the beam.
 LONG_STEPS = {("lidar_volpath", "attenuation"): 0.04, ("lidar_merging", "divergence_mrad"): 0.1}
 #: Places of renders, in steps, and their weights in a difference of fourth order.
@@ -196,13 +189,11 @@ def _ratio(score, slope, error):
 
 
 def describe(z):
-    """Return the distribution of z as text."""
     beyond = " ".join(f"{100 * np.mean(np.abs(z) > limit):5.1f}" for limit in (2, 3))
     return f"{z.size:5} {np.sqrt(np.mean(z**2)):5.2f} {beyond} {np.abs(z).max():5.1f}"
 
 
 def main():
-    """Compare the cases and print a row for each parameter."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", choices=CASES, action="append", help="by default all")
     parser.add_argument("--integrator", choices=SAMPLES, action="append", help="by default both")

@@ -1,6 +1,7 @@
 """Fixtures that every kind of test shares."""
 
 import os
+import signal
 
 # Before NumPy: threads that wait for each other take more time than the small matrices of tests, all the more in two
 # processes.
@@ -119,8 +120,15 @@ def _build(*, integrator=None, tx=None, rx=None, film=None, sea=None, water=None
 
 @pytest.fixture
 def lidar_scene():
-    """Builder of scenes; see `_build`."""
     return _build
+
+
+@pytest.fixture
+def default_ctrl_c():
+    """Python's own handler: a shell that starts the tests in the background leaves Ctrl-C ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

@@ -39,8 +39,13 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import h5py
 import numpy as np
+import xarray as xr
 from input_files import KINDS
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.catalogue import PLUGINS, limits
 
 LIMIT_S = 30
 
@@ -49,22 +54,7 @@ OTHERS = " (others)"
 
 #: What numbers and texts are replaced by.
 _ODD_TEXTS = (
-    "nan",
-    "inf",
-    "-1",
-    "0",
-    "1e300",
-    "-1e-300",
-    "1e999",
-    "",
-    "x",
-    "[]",
-    "9" * 30,
-    "true",
-    "$x",
-    "../a",
-    "é",
-    "'",
+    *("nan", "inf", "-1", "0", "1e300", "-1e-300", "1e999", "", "x", "[]", "9" * 30, "true", "$x", "../a", "é", "'"),
 )
 _ODD_VALUES: tuple[Any, ...] = (
     *(np.nan, np.inf, -1.0, 0.0, 0, 1e300, -1e-300, 2**62, "", "x", "nan", "{", "[1", '{"a": 1}', "null"),
@@ -128,8 +118,6 @@ def damage_text(path: Path, rng: random.Random) -> None:
 
 def damage_attributes(path: Path, rng: random.Random) -> None:
     """Replace an attribute, a coordinate or a variable of a NetCDF file by an odd one, or remove it."""
-    import xarray as xr
-
     dataset = xr.load_dataset(path, engine="h5netcdf", decode_times=False)
     names = [("attribute", name) for name in dataset.attrs] * 2 + [("array", str(name)) for name in dataset.variables]
     where, name = rng.choice(names)
@@ -160,8 +148,6 @@ def damage_attributes(path: Path, rng: random.Random) -> None:
 
 def set_extreme(path: Path, rng: random.Random) -> None:
     """Set one parameter of a plugin of a scene to an end of its range, or to an extreme."""
-    from mitransient_lidar.core.parameters.catalogue import PLUGINS, limits
-
     tree = ElementTree.parse(path)
     parts = [(part, each.name) for part in tree.iter() for each in PLUGINS.get(part.get("type", ""), ())]
     part, name = rng.choice(parts)
@@ -175,7 +161,6 @@ def set_extreme(path: Path, rng: random.Random) -> None:
 
 
 def _one_of(folder: Path, rng: random.Random) -> Path:
-    """Return a file of a folder."""
     return rng.choice(sorted(one for one in folder.rglob("*") if one.is_file()))
 
 
@@ -209,8 +194,6 @@ def put_another(path: Path, rng: random.Random) -> None:
 
 def _refer(path: Path, other: Path, rng: random.Random) -> None:
     """Replace a dataset of an HDF5 file by one whose values another file holds, or by a link into that file."""
-    import h5py
-
     with h5py.File(path, "r+") as file:
         names: list[str] = []
         file.visititems(lambda name, part: names.append(name) if isinstance(part, h5py.Dataset) else None)
@@ -234,8 +217,6 @@ DAMAGE = {"bytes": damage_bytes, "text": damage_text, "attributes": damage_attri
 
 def attempts(name: str, first: int, count: int, original: Path) -> Iterator[tuple[int, str, str]]:
     """Yield number, result and cause of damaged files of a kind."""
-    from mitransient_lidar.core.errors import UserError
-
     warnings.simplefilter("ignore")
     logging.disable()
     signal.signal(signal.SIGALRM, _too_long)
@@ -280,7 +261,6 @@ def _too_long(*_: object) -> None:
 
 
 def _place(error: BaseException) -> str:
-    """Return the last place of this package in a traceback."""
     own = [frame for frame in traceback.extract_tb(error.__traceback__) if "/mitransient_lidar/" in frame.filename]
     return f"at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
 
@@ -318,7 +298,6 @@ def measure(name: str, first: int, count: int, folder: Path) -> Counter[str]:
 
 
 def main() -> None:
-    """Read damaged files, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="KIND", help=f"kinds of files; default: all of {', '.join(KINDS)}")
     parser.add_argument("--count", type=int, default=0, help="number of damaged files of each kind")

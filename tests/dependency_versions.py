@@ -34,7 +34,6 @@ PREFIX, FORGOTTEN_S = "dependency-versions-", 24 * 3600.0
 
 
 def requirements(*extras):
-    """Return the dependencies of the package and those of extras."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     texts = [*project["dependencies"], *(text for extra in extras for text in project["optional-dependencies"][extra])]
     return [one for one in map(Requirement, texts) if one.name != project["name"]]
@@ -70,7 +69,6 @@ def make_environment(folder, python, which):
 
 
 def main():
-    """Make the environment, run the tests and print the versions."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

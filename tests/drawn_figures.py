@@ -55,12 +55,10 @@ def described_axes(ax):
 
 
 def array_of(mappable):
-    """Return what the colours of an image or a mesh stand for."""
     return [] if mappable.get_array() is None else numbers(mappable.get_array())
 
 
 def described_image(image):
-    """Return place, colours and values of an image."""
     alpha = [] if image.get_alpha() is None else image.get_alpha()
     colours = [numbers(image.get_clim()), image.get_cmap().name, numbers(alpha)]
     return [numbers(image.get_extent()), image.origin, *colours, *array_of(image)]

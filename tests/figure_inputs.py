@@ -36,7 +36,6 @@ LIDAR |= {"layout": "2x2", "field_of_view_mrad": 30.0, "field_of_view_shape": "c
 
 
 def random(seed):
-    """Return random numbers."""
     return np.random.default_rng(seed)
 
 
@@ -155,7 +154,6 @@ def found_shots(waveforms=True):
 
 
 def fitted():
-    """Return a fit of two pixels."""
     data = noisy(0.002, random(1), pixels=("a", "b"))
     return WaveformFit(measured(data), lambda values: closed_form(values, pixels=("a", "b")), TRUTH).run()
 

@@ -79,13 +79,8 @@ def run(case, count, receiver, first):
     found = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     print(f"{case}, {receiver}: {found['right'].sum()} of {len(rows)} end within {RIGHT} standard errors of the truth")
     error, stated, model = (np.sqrt(np.mean(found[name] ** 2, axis=0)) for name in ("error", "stated", "model"))
-    shares = {
-        "bound": 100 * bound,
-        "stated by the record alone / bound": np.sqrt(stated**2 - model**2) / bound,
-        "stated / bound": stated / bound,
-        "error / bound": error / bound,
-        "error / stated": error / stated,
-    }
+    shares = {"bound": 100 * bound, "stated by the record alone / bound": np.sqrt(stated**2 - model**2) / bound}
+    shares |= {"stated / bound": stated / bound, "error / bound": error / bound, "error / stated": error / stated}
     for place, name in enumerate(names):
         print(f"  {name:20} " + ", ".join(f"{label} {value[place]:.3g}" for label, value in shares.items()))
     spread = found["distance"].std(ddof=1) / np.sqrt(len(rows))
@@ -95,7 +90,6 @@ def run(case, count, receiver, first):
 
 
 def main():
-    """Read the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", choices=CASES, default="column")
     parser.add_argument("--count", type=int, default=25)

@@ -93,7 +93,6 @@ def deepest(depth: np.ndarray, found: np.ndarray) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print a row for each case, or for those whose numbers are given."""
     print(
         "instrument          depths [m]    found by the flight  forecast  deepest, flight   forecast  forecast's time"
     )

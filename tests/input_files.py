@@ -12,6 +12,36 @@ from typing import Any, NamedTuple
 import numpy as np
 from array_inputs import height_map, image, load_map, mesh, read_image
 
+import mitransient_lidar
+from mitransient_lidar import results
+from mitransient_lidar.analysis.gates.cut import cut_gates
+from mitransient_lidar.analysis.information.measured import measured
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.analysis.retrieval.retrieve import retrieve
+from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
+from mitransient_lidar.analysis.waveforms.echo_table import extract
+from mitransient_lidar.campaigns.design import Campaign
+from mitransient_lidar.campaigns.runs import RunRenderer
+from mitransient_lidar.campaigns.store import Store, open_campaign, reporting_damage
+from mitransient_lidar.campaigns.sweep import campaign as run_campaign
+from mitransient_lidar.campaigns.sweep import describe_campaign
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.formats.documents import check_keys, parse_toml, required, table
+from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
+from mitransient_lidar.flights.poses.platforms import platform_of
+from mitransient_lidar.flights.poses.scanner import Scanner
+from mitransient_lidar.loading import scenes, variants
+from mitransient_lidar.loading.catalogue import copy_scene, folder_of_scenes
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.physics.receiver.receiver_files import receiver
+from mitransient_lidar.plots.campaigns import plot_campaign
+from mitransient_lidar.plots.gates.images import plot_gates
+from mitransient_lidar.plots.waveforms import plot_waveforms
+from mitransient_lidar.rendering.again import describe_result
+from mitransient_lidar.rendering.render import render_again
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
+
 
 class Kind(NamedTuple):
     """A kind of file: what writes a good one into a folder, what a user does with it, and how it is damaged.
@@ -25,26 +55,12 @@ class Kind(NamedTuple):
 
 
 def shot() -> Any:
-    """Return a small result, rendered once."""
-    import mitransient_lidar
-
     params = {"layout": "2x2", "time_start_ns": 1400, "bin_count": 150, "spectrum": "flat"}
     return mitransient_lidar.render("table1", params=params, passes=4)
 
 
-def series() -> Any:
-    """Return a small series of shots."""
-    import mitransient_lidar
-
-    return mitransient_lidar.render_shots("table1", params={"layout": "2x2"}, count=3, passes=2)
-
-
 def saved(dataset: Callable[[], Any], name: str) -> Callable[[Path], Path]:
-    """Return what writes a result."""
-
     def make(folder: Path) -> Path:
-        from mitransient_lidar import results
-
         results.save(dataset(), folder / name)
         return folder / name
 
@@ -52,22 +68,19 @@ def saved(dataset: Callable[[], Any], name: str) -> Callable[[Path], Path]:
 
 
 def written(name: str, text: str) -> Callable[[Path], Path]:
-    """Return what writes a text."""
+    return lambda folder: (folder / name).write_text(text) and folder / name
 
-    def make(folder: Path) -> Path:
-        (folder / name).write_text(text)
-        return folder / name
 
-    return make
+def series() -> Any:
+    return mitransient_lidar.render_shots("table1", params={"layout": "2x2"}, count=3, passes=2)
+
+
+def gates() -> Any:
+    return mitransient_lidar.render("gated_waves", passes=2)
 
 
 def analyse(path: Path) -> None:
     """Use a result as the commands waveforms, retrieve and plot do."""
-    from mitransient_lidar import results
-    from mitransient_lidar.analysis.retrieval.retrieve import retrieve
-    from mitransient_lidar.analysis.waveforms.echo_table import extract
-    from mitransient_lidar.plots.waveforms import plot_waveforms
-
     # Reading takes as long as each use.
     opened = functools.cache(lambda: results.open(path))
     _each(
@@ -79,13 +92,6 @@ def analyse(path: Path) -> None:
 
 def use_again(path: Path) -> None:
     """Use a result as a scene, and cut gates and a record of a receiver from it."""
-    from mitransient_lidar import results
-    from mitransient_lidar.analysis.gates.cut import cut_gates
-    from mitransient_lidar.analysis.receiver import detect_waveforms
-    from mitransient_lidar.physics.lidar.gate_train import GateTrain
-    from mitransient_lidar.rendering.again import describe_result
-    from mitransient_lidar.rendering.render import render_again
-
     _each(
         lambda: describe_result(path),
         lambda: render_again(path, passes=2),
@@ -96,8 +102,6 @@ def use_again(path: Path) -> None:
 
 def _each(*uses: Callable[[], object]) -> None:
     """Call all; raise a refusal at the end."""
-    from mitransient_lidar.core.errors import UserError
-
     refusal = None
     for use in uses:
         try:
@@ -109,25 +113,17 @@ def _each(*uses: Callable[[], object]) -> None:
 
 
 def scene(folder: Path) -> Path:
-    """Write a self-contained scene."""
-    from mitransient_lidar.loading.catalogue import copy_scene
-
     return copy_scene("fig13_2x2", folder / "scene.xml")
 
 
 def load(path: Path) -> None:
     """Load a scene, and plan the record of its lidar."""
-    from mitransient_lidar.loading.scenes import open_scene
-    from mitransient_lidar.transport.scene_parts import find_lidar_scene
-
-    session = open_scene(path, None)
+    session = scenes.open_scene(path, None)
     find_lidar_scene(session.scene, session.sensor)
 
 
 def small_scene(folder: Path) -> Path:
     """Write the default scene, with few paths a pass."""
-    from mitransient_lidar.loading.catalogue import copy_scene
-
     path = copy_scene("table1", folder / "scene.xml")
     counts = "".join(f'<integer name="{one}_per_pass" value="8192"/>' for one in ("paths", "photons"))
     whole, text = '<integrator type="lidar_merging"/>', path.read_text()
@@ -138,8 +134,6 @@ def small_scene(folder: Path) -> Path:
 
 def render_small(path: Path) -> None:
     """Render a scene within 3 GB, half of which large arrays may take, and check that its light is finite."""
-    import mitransient_lidar
-
     resource.setrlimit(resource.RLIMIT_DATA, (3 * 10**9, resource.getrlimit(resource.RLIMIT_DATA)[1]))
     result = mitransient_lidar.render(path, passes=2)
     for name, array in result.data_vars.items():
@@ -163,7 +157,6 @@ def load_part(kind: str, **parameters: Any) -> Callable[[Path], None]:
     """Return what loads an object of Mitsuba's in a scene, whose parameters may be FILE."""
 
     def read(path: Path) -> None:
-        from mitransient_lidar.loading import scenes
 
         def filled(part: dict[str, Any]) -> dict[str, Any]:
             values = {name: filled(one) if isinstance(one, dict) else one for name, one in part.items()}
@@ -175,27 +168,6 @@ def load_part(kind: str, **parameters: Any) -> Callable[[Path], None]:
 
 
 _SPECTRUM = "".join(f"{wavelength} {0.1 + wavelength / 1e4:.4f}\n" for wavelength in range(400, 700, 20))
-
-
-def gates(name: str) -> Callable[[Path], Path]:
-    """Return what writes a gate stack."""
-
-    def make(folder: Path) -> Path:
-        import mitransient_lidar
-        from mitransient_lidar import results
-
-        results.save(mitransient_lidar.render("gated_waves", passes=2), folder / name)
-        return folder / name
-
-    return make
-
-
-def draw_gates(path: Path) -> None:
-    """Open and draw a gate stack."""
-    from mitransient_lidar import results
-    from mitransient_lidar.plots.gates.images import plot_gates
-
-    plot_gates(results.open(path))
 
 
 _CAMPAIGN = """scene = "table1"
@@ -218,34 +190,22 @@ seed = 3
 
 
 def plan(path: Path) -> None:
-    """Read a campaign, and plan its runs."""
-    from mitransient_lidar.campaigns.design import Campaign
-    from mitransient_lidar.campaigns.runs import RunRenderer
-
     campaign = Campaign.read(path)
     RunRenderer.of(campaign, campaign.table())
 
 
 def table_of_runs(folder: Path) -> Path:
-    """Write the table of a campaign."""
     (folder / "runs.csv").write_text("attenuation,bottom_depth,layout\n0.2,4.5,2x2\n0.3,5,1x1\n0.35,5.5,2x2\n")
     return folder / "runs.csv"
 
 
 def plan_table(path: Path) -> None:
-    """Plan the runs of a table."""
-    from mitransient_lidar.campaigns.design import Campaign
-    from mitransient_lidar.campaigns.runs import RunRenderer
-
     given = {"scene": "table1", "design": {"file": path.name}, "fixed": {"time_start_ns": 1400, "bin_count": 200}}
     campaign = Campaign.of_file(given, path.parent)
     RunRenderer.of(campaign, campaign.table())
 
 
 def store(folder: Path) -> Path:
-    """Render a small campaign."""
-    from mitransient_lidar.campaigns.sweep import campaign as run_campaign
-
     fixed = {"spectrum": "flat", "layout": "1x1", "time_start_ns": 1380, "bin_count": 160}
     given = {
         **{"scene": "table1", "target_error": 0.5, "keep": ["waveform", "echoes", "truth"], "fixed": fixed},
@@ -257,9 +217,6 @@ def store(folder: Path) -> Path:
 
 def read_store(path: Path) -> None:
     """Read everything that a store holds, as far as it is not damaged, and draw it."""
-    from mitransient_lidar.campaigns.store import Store, open_campaign, reporting_damage
-    from mitransient_lidar.campaigns.sweep import describe_campaign
-    from mitransient_lidar.plots.campaigns import plot_campaign
 
     def draw() -> None:
         with reporting_damage(path):
@@ -293,13 +250,6 @@ lever_arm = [0.3, 1.2, -0.5]
 
 
 def fly(path: Path) -> None:
-    """Work out the pulses of a flight."""
-    from mitransient_lidar.core.files import read_text
-    from mitransient_lidar.core.formats.documents import check_keys, parse_toml, required, table
-    from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
-    from mitransient_lidar.flights.poses.platforms import platform_of
-    from mitransient_lidar.flights.poses.scanner import Scanner
-
     tables = ("platform", "scanner", "mounting")
     given = parse_toml(read_text(path), path)
     check_keys("a flight", given, tables)
@@ -310,7 +260,6 @@ def fly(path: Path) -> None:
 
 
 def sbet(folder: Path) -> Path:
-    """Write an SBET file."""
     data = np.zeros((9, 17))
     data[:, 0], data[:, 3] = 345600 + np.arange(9) / 200, 350.0
     data[:, 1:3] = np.radians([60.0, 15.0]) + 1e-7 * np.arange(9)[:, None]
@@ -323,8 +272,6 @@ def follow(**platform: Any) -> Callable[[Path], None]:
     """Return what reads a trajectory from a file, and interpolates it."""
 
     def read(path: Path) -> None:
-        from mitransient_lidar.flights.poses.platforms import platform_of
-
         trajectory = platform_of({"file": path.name, **platform}).trajectory(path.parent)
         trajectory.at(np.linspace(*trajectory.lines[0], 50))
 
@@ -345,12 +292,9 @@ _PROFILE = """depth (m),attenuation (1/m),scattering (1/m)
 
 
 def load_plugin(**parameters: str) -> Callable[[Path], None]:
-    """Return what loads a plugin with a file."""
-
     def read(path: Path) -> None:
+        # After the package, which sets the path of LLVM.
         import mitsuba as mi
-
-        from mitransient_lidar.loading import scenes, variants
 
         variants.set_variant()
         with scenes.as_user_error():
@@ -360,35 +304,7 @@ def load_plugin(**parameters: str) -> Callable[[Path], None]:
 
 
 def shipped(name: str) -> Callable[[Path], Path]:
-    """Return what copies a file of an instrument."""
-
-    def make(folder: Path) -> Path:
-        from mitransient_lidar.loading.catalogue import folder_of_scenes
-
-        return Path(shutil.copy(folder_of_scenes() / "instruments" / name, folder / name))
-
-    return make
-
-
-def read_receiver(path: Path) -> None:
-    """Read a receiver."""
-    from mitransient_lidar.physics.receiver.receiver_files import receiver
-
-    receiver(str(path))
-
-
-def read_corrections(path: Path) -> None:
-    """Read a table of corrections."""
-    from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
-
-    corrections_for("", path)
-
-
-def read_measured(path: Path) -> None:
-    """Read measured waveforms."""
-    from mitransient_lidar.analysis.information.measured import measured
-
-    measured(path)
+    return lambda folder: Path(shutil.copy(folder_of_scenes() / "instruments" / name, folder / name))
 
 
 _MEASURED = "time_ns,red,red_stderr\n" + "".join(f"{i},{1 + i % 5},{0.1 + 0.01 * i:.2f}\n" for i in range(30))
@@ -411,8 +327,8 @@ KINDS = {
     "result_attributes": Kind(saved(shot, "a.nc"), analyse, "attributes"),
     "result_again": Kind(saved(shot, "a.nc"), use_again, "attributes"),
     "series_attributes": Kind(saved(series, "a.nc"), analyse, "attributes"),
-    "gates_exr": Kind(gates("a_gates.exr"), draw_gates),
-    "gates_attributes": Kind(gates("a_gates.nc"), draw_gates, "attributes"),
+    "gates_exr": Kind(saved(gates, "a_gates.exr"), lambda path: plot_gates(results.open(path))),
+    "gates_attributes": Kind(saved(gates, "a_gates.nc"), lambda path: plot_gates(results.open(path)), "attributes"),
     "campaign": Kind(written("a.toml", _CAMPAIGN), plan, "text"),
     "flight": Kind(written("a.toml", _PLAN), fly, "text"),
     "trajectory": Kind(written("a.trj", _TRAJECTORY), follow(kind="csv"), "text"),
@@ -427,8 +343,8 @@ KINDS = {
     "profile": Kind(written("a.csv", _PROFILE), load_plugin(type="layered_water", profile="FILE"), "text"),
     "phase_function": Kind(written("a.csv", _PHASE), load_plugin(type="measured_phase", filename="FILE"), "text"),
     "pulse": Kind(written("a.csv", _PULSE), load_plugin(type="lidar_transmitter", pulse_file="FILE"), "text"),
-    "receiver": Kind(shipped("leica_hawkeye4x_deep.toml"), read_receiver, "text"),
-    "corrections": Kind(shipped("leica_hawkeye4x_deep_depths.nc"), read_corrections),
-    "measured": Kind(written("a.csv", _MEASURED), read_measured, "text"),
+    "receiver": Kind(shipped("leica_hawkeye4x_deep.toml"), lambda path: receiver(str(path)), "text"),
+    "corrections": Kind(shipped("leica_hawkeye4x_deep_depths.nc"), lambda path: corrections_for("", path)),
+    "measured": Kind(written("a.csv", _MEASURED), measured, "text"),
     **{f"image{suffix}": Kind(image(suffix), read_image) for suffix in (".png", ".npy", ".exr")},
 }

@@ -82,7 +82,6 @@ class Row:
     passes: tuple[np.ndarray, np.ndarray] | None = None
 
     def ratio(self):
-        """Return the ratio of the energies and its standard error."""
         (a, da), (b, db) = ((one.mean(), one.std(ddof=1) / len(one) ** 0.5) for one in self.passes)
         return a / b, a / b * np.hypot(da / a, db / b)
 
@@ -102,7 +101,6 @@ def base(**parts):
 
 
 def placed(size, *place, turn=0.0):
-    """Return where a shape lies in the scene."""
     return mi.ScalarTransform4f().translate(list(place)).rotate([1, 0, 0], turn).scale(size)
 
 
@@ -204,7 +202,6 @@ def bsdfs(_):
 
 
 def textures(folder):
-    """Return a plate of each texture."""
     square = mi.Mesh("square", 4, 2)
     values = mi.traverse(square)
     values["vertex_positions"] = [-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0]
@@ -241,7 +238,6 @@ def textures(folder):
 
 
 def phase_functions(_):
-    """Return a scene of each phase function."""
     own = {
         "hg": {"g": 0.8},
         "isotropic": {},
@@ -367,7 +363,6 @@ def rows(passes, wanted=()):
 
 
 def table(found):
-    """Return the text of the table, by kind."""
     lines = []
     for kind in KINDS:
         heading = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", kind)
@@ -393,7 +388,6 @@ def read_page():
 
 
 def main():
-    """Write the table of the page again."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--passes", type=int, default=40, help="passes of the fast integrator")
     parser.add_argument("plugins", nargs="*", help="print the ratio of these alone")

@@ -178,7 +178,6 @@ class RandomSolids:
         return {"type": "bitmap", "data": values, "raw": True}
 
     def diffuse(self):
-        """Return a Lambertian BSDF, at times textured."""
         given = self.texture() if self.rng.random() < 0.3 else {"type": "spectrum", "value": self.size(0.1, 0.8)}
         return {"type": "diffuse", "reflectance": given}
 
@@ -351,7 +350,6 @@ def summary(compared, found, rows):
 
 
 def main():
-    """Compare scenes and print the findings."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=10, help="number of scenes")
     parser.add_argument("--first", type=int, default=0, help="number of the first scene")

@@ -14,7 +14,6 @@ SCENES = TESTS / "unit" / "loading" / "shipped_scenes.json"
 
 
 def read(path):
-    """Return the contents of a reference file."""
     return json.loads(path.read_text("utf-8"))
 
 

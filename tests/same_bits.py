@@ -2,7 +2,6 @@
 
 
 def assert_same_bits(first, second):
-    """Assert that two data sets have the same variables and coordinates, of the same types and the same bits."""
     assert set(first.variables) == set(second.variables)
     for name, variable in first.variables.items():
         assert variable.dtype == second[name].dtype

@@ -122,7 +122,6 @@ def flight():
 
 
 def differences(old, new):
-    """Return sentences about what differs between two datasets."""
     said = []
     for name in sorted(set(old.variables) ^ set(new.variables)):
         said.append(f"{name} is only in the {'old' if name in old.variables else 'new'} one")

@@ -23,20 +23,9 @@ ANGLE_X = np.array([3.0, 3.0, -3.0, -3.0])
 ANGLE_Y = np.array([-3.0, 3.0, -3.0, 3.0])
 ENERGY = 5e-3 * 0.81 * 0.9 * 0.025  # pulse, optics, air, aperture [J m^2]
 A, BB, RHO, DEPTH = 0.12, 0.008, 0.25, 8.0
-ATTRIBUTES = {
-    "altitude": 200.0,
-    "off_nadir_deg": 20.0,
-    "refractive_index": N,
-    "group_index": N,
-    "pulse_fwhm_ns": 4.0,
-    "pulse_energy_mj": 5.0,
-    "aperture_area": 0.025,
-    "field_of_view_mrad": 60.0,
-    "divergence_mrad": 0.1,
-    "surface_time_ns": SURFACE,
-    "surface_heights_m": [0.0, 0.0],
-    "two_way_efficiency": 0.9**3,
-}
+ATTRIBUTES = {"altitude": 200.0, "off_nadir_deg": 20.0, "refractive_index": N, "group_index": N, "pulse_fwhm_ns": 4.0}
+ATTRIBUTES |= {"pulse_energy_mj": 5.0, "aperture_area": 0.025, "field_of_view_mrad": 60.0, "divergence_mrad": 0.1}
+ATTRIBUTES |= {"surface_time_ns": SURFACE, "surface_heights_m": [0.0, 0.0], "two_way_efficiency": 0.9**3}
 
 
 def normal_transmittance():

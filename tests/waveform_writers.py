@@ -35,7 +35,6 @@ class Packets(NamedTuple):
 
     @property
     def descriptor(self) -> bytes:
-        """Wave packet descriptor."""
         about = self.bits, self.compression, len(self.counts[0]), self.spacing_ps, self.gain, self.offset
         return struct.pack("<BBIIdd", *about)
 

@@ -285,7 +285,6 @@ SLOW = {"layers and bubbles under waves", "materials and bitmaps", "waves over a
 
 
 def tier_of(name):
-    """Return the marks of a case."""
     return [] if name == MIXED else pytest.mark.slow if name in SLOW else pytest.mark.long
 
 

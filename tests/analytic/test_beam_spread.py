@@ -28,7 +28,6 @@ LARGE_SEA = {"size": 4000.0, "slope_variance": "2e-5"}
 
 
 def parts_of(lidar_scene, water, tx=PENCIL, **options):
-    """Return the parts of a scene with a large flat sea."""
     water = {"backscattering": 0.0, **water}
     scene = lidar_scene(tx=tx, rx=VIEW, sea=LARGE_SEA, water=water, **options)
     return find_lidar_scene(scene, scene.sensors()[0])
@@ -36,7 +35,6 @@ def parts_of(lidar_scene, water, tx=PENCIL, **options):
 
 @pytest.fixture
 def system(lidar_scene):
-    """Builder of these parts."""
     return partial(parts_of, lidar_scene)
 
 

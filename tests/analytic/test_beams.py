@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from oracles.lidar_equation import bottom_energy
+from rows import each_case
 from significance import assert_equal, largest_z
 
 from mitransient_lidar.core.constants import C0
@@ -69,12 +70,8 @@ def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, t
     if kind == "image":
         transmitter, density, half = image_parameters(tmp_path), cells, 2.5e-3
     else:
-        transmitter = {
-            "beam_profile": kind,
-            "divergence_mrad": 12.0,
-            "divergence_across_mrad": 3.0,
-            "ellipse_deg": 30.0,
-        }
+        transmitter = {"beam_profile": kind, "divergence_mrad": 12.0, "divergence_across_mrad": 3.0}
+        transmitter |= {"ellipse_deg": 30.0}
         density, half = ellipse(6e-3, 1.5e-3, np.radians(30), kind == "top_hat"), 3e-3
     scene = lidar_scene(
         tx=transmitter,
@@ -106,11 +103,8 @@ def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("integrator", "variance", "depth", "spread"),
-    [("lidar_volpath", 5e-4, 0.48, 0.7e-3), ("lidar_merging", 1e-5, 0.48, 0.7e-3)],
-)
-def test_bottom_in_beam_and_view_of_millimetres(lidar_scene, passes, integrator, variance, depth, spread):
+@each_case(("lidar_volpath", 5e-4, 0.48, 0.7e-3), ("lidar_merging", 1e-5, 0.48, 0.7e-3))
+def test_bottom_in_beam_and_view_of_millimetres(integrator, variance, depth, spread, lidar_scene, passes):
     """Patches that grew with depth as broad light does, from a millimetre, lost 88 % of it.
 
     Slopes of the variance s^2 in each direction turn light and lines of sight by D s, D = 1 - 1/n, so that a share

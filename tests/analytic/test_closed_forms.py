@@ -14,6 +14,7 @@ from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, s
 from oracles.echo_times import bottom_time_ns
 from oracles.lidar_equation import bottom_energy, column_energy, cos_water, surface_energy
 from oracles.phase import henyey_greenstein
+from rows import each_case
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.level_sea import LidarSystem, surface_time_ns
@@ -77,7 +78,6 @@ CASES = {
 
 
 def tier_of(name, integrator):
-    """Return the marks of a case."""
     if name == QUICK:
         return []
     # The quick case has both integrators; the mast differs from it the most, in the phase function as well.
@@ -85,7 +85,6 @@ def tier_of(name, integrator):
 
 
 def both_in(names):
-    """Return the mark of a test of both integrators in some cases."""
     both = [(name, integrator) for integrator in INTEGRATORS for name in names]
     cases = [pytest.param(*each, marks=tier_of(*each)) for each in both]
     return pytest.mark.parametrize(("case", "integrator"), cases, indirect=["case"])
@@ -206,14 +205,11 @@ def test_water_in_the_near_infrared(lidar_scene, passes, integrator):
     significance.assert_equal(found, expected[1:9], error=0.03, bias=0.01)
 
 
-@pytest.mark.parametrize(
-    ("wind", "angle", "wind_from_deg"),
-    [
-        *((6.0, *place) for place in ((20.0, 0.0), (20.0, 180.0), (12.0, 120.0))),
-        *((10.0, 30.0, wind_from_deg) for wind_from_deg in (0.0, 180.0)),
-    ],
+@each_case(
+    *((6.0, *place) for place in ((20.0, 0.0), (20.0, 180.0), (12.0, 120.0))),
+    *((10.0, 30.0, wind_from_deg) for wind_from_deg in (0.0, 180.0)),
 )
-def test_surface_of_measured_slopes(lidar_scene, passes, wind, angle, wind_from_deg):
+def test_surface_of_measured_slopes(wind, angle, wind_from_deg, lidar_scene, passes):
     """Cox and Munk's series at 6 m/s, looking upwind, downwind and aside: 1.19, 0.74 and 0.93 times the Gaussian.
 
     At 30 degrees and 10 m/s, 3.9 standard deviations of the slopes, 2.31 upwind and 0.19 times downwind.
@@ -377,10 +373,8 @@ def test_narrow_view_of_a_wide_beam(lidar_scene, view):
     significance.assert_equal(energy[:, 0, 1, :7], expected, error=0.02, bias=5e-3)
 
 
-@pytest.mark.parametrize(
-    "options", [pytest.param({}, marks=pytest.mark.long), pytest.param({"point_spacing": 0.4}, marks=pytest.mark.slow)]
-)
-def test_column_ends_at_the_bottom(lidar_scene, passes, options):
+@each_case(pytest.param({}, marks=pytest.mark.long), pytest.param({"point_spacing": 0.4}, marks=pytest.mark.slow))
+def test_column_ends_at_the_bottom(options, lidar_scene, passes):
     """The last tenth of a column above a black bottom; cells that it cuts lost 6 and 21 % of it."""
     height, depth, beam = 730.0, 1.4, 10.0
     surface_ns = float(surface_time_ns(height, 0.0))

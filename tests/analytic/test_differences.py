@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import significance
+from rows import each_case
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading.parameters import with_value
@@ -39,7 +40,6 @@ def slopes(name, params, steps=None):
 
 
 def axis_of(session):
-    """Return the time bins of a scene."""
     return find_lidar_scene(session.scene, session.sensor).axis
 
 
@@ -51,7 +51,6 @@ def each_energy(session, integrator=SMALL, seed=OTHERS, axis=None):
 
 
 def energies(session, seed=OTHERS, axis=None):
-    """Return energies [J], a row for each pass."""
     return each_energy(session, seed=seed, axis=axis).sum(axis=1)
 
 
@@ -94,23 +93,20 @@ def test_light_just_above_a_dark_bottom_that_sinks():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("scene", "params", "name", "step", "integrator"),
-    [
-        ("table1", {"layout": "2x2"}, "surface_slope_x_deg", 0.3, "lidar_merging"),
-        ("table1", {"layout": "2x2"}, "surface_slope_x_deg", 0.3, "lidar_volpath"),
-        ("table1", {}, "off_nadir_deg", 0.1, "lidar_merging"),
-        ("table1", {}, "off_nadir_deg", 0.1, "lidar_volpath"),
-        ("table1", {}, "bottom_depth", 0.1, "lidar_merging"),
-        ("table1", {}, "bottom_depth", 0.1, "lidar_volpath"),
-        ("flight", {"cube_depth": 20, "bottom_ripple_height": 0}, "bottom_slope_x_deg", 2.0, "lidar_merging"),
-        ("flight", {"cube_depth": 20, "bottom_ripple_height": 0}, "bottom_slope_x_deg", 2.0, "lidar_volpath"),
-        ("fig15_2x2", {}, "layer_tops[1]", 0.3, "lidar_merging"),
-        ("table1", {"field_of_view_mrad": 12}, "field_of_view_mrad", 1.5, "lidar_merging"),
-        ("table1", {"field_of_view_mrad": 12}, "field_of_view_mrad", 1.5, "lidar_volpath"),
-        ("table1", {"field_of_view_mrad": 12}, "divergence_mrad", 1.5, "lidar_merging"),
-        ("table1", {"field_of_view_mrad": 12}, "divergence_mrad", 1.5, "lidar_volpath"),
-    ],
+@each_case(
+    ("table1", {"layout": "2x2"}, "surface_slope_x_deg", 0.3, "lidar_merging"),
+    ("table1", {"layout": "2x2"}, "surface_slope_x_deg", 0.3, "lidar_volpath"),
+    ("table1", {}, "off_nadir_deg", 0.1, "lidar_merging"),
+    ("table1", {}, "off_nadir_deg", 0.1, "lidar_volpath"),
+    ("table1", {}, "bottom_depth", 0.1, "lidar_merging"),
+    ("table1", {}, "bottom_depth", 0.1, "lidar_volpath"),
+    ("flight", {"cube_depth": 20, "bottom_ripple_height": 0}, "bottom_slope_x_deg", 2.0, "lidar_merging"),
+    ("flight", {"cube_depth": 20, "bottom_ripple_height": 0}, "bottom_slope_x_deg", 2.0, "lidar_volpath"),
+    ("fig15_2x2", {}, "layer_tops[1]", 0.3, "lidar_merging"),
+    ("table1", {"field_of_view_mrad": 12}, "field_of_view_mrad", 1.5, "lidar_merging"),
+    ("table1", {"field_of_view_mrad": 12}, "field_of_view_mrad", 1.5, "lidar_volpath"),
+    ("table1", {"field_of_view_mrad": 12}, "divergence_mrad", 1.5, "lidar_merging"),
+    ("table1", {"field_of_view_mrad": 12}, "divergence_mrad", 1.5, "lidar_volpath"),
 )
 def test_geometry_against_scenes_beside_it(scene, params, name, step, integrator):
     """Every bin of 5 ns of every pixel, against the difference of two scenes on random numbers of their own.

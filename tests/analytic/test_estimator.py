@@ -1,11 +1,11 @@
 """Properties that the estimator must have whatever the scene: sums, reciprocity, strategies that agree, energy."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import drjit as dr
 import numpy as np
 import pytest
+from rows import each_case
 from significance import assert_same, largest_error, largest_z
 
 #: Cells and shortest wave are the same for every beam and view.
@@ -28,20 +28,7 @@ def compare(first, second, largest):
     assert np.all(np.abs(z) < largest_z(min(len(first), len(second)), z.size)), z
 
 
-@pytest.mark.slow
-def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes):
-    """Same seed: the same paths, given to other pixels. A pixel counted twice or left out at an edge would show."""
-    energies = []
-    for name, seed in (("1x1", 0), ("2x2", 0), ("1x4", 0), ("1x1", 1)):
-        scene = lidar_scene(rx={"layout": name, "imager": False}, sea=WAVY, integrator={"paths_per_pass": 2**12})
-        energies.append(passes(scene, 1, seed).sum(axis=1))
-    for parts in energies[1:3]:
-        np.testing.assert_allclose(parts, energies[0], rtol=1e-10)
-    assert np.mean(energies[0] == energies[3]) < 0.6
-
-
 def with_total(energy):
-    """Append the sum over the bins as a last column."""
     return np.concatenate([energy, energy.sum(axis=1, keepdims=True)], axis=1)
 
 
@@ -78,10 +65,8 @@ def test_connections_of_a_bottom_have_one_mean(lidar_scene, passes):
     assert_same(combined, walk, error=0.02)
 
 
-@pytest.mark.parametrize(
-    "sea", [pytest.param(ROUGH, marks=pytest.mark.slow), pytest.param(WAVY, marks=pytest.mark.long)]
-)
-def test_reciprocity_of_beam_and_field_of_view(lidar_scene, passes, sea):
+@each_case(pytest.param(ROUGH, marks=pytest.mark.slow), pytest.param(WAVY, marks=pytest.mark.long))
+def test_reciprocity_of_beam_and_field_of_view(sea, lidar_scene, passes):
     """A uniform beam seen by a uniform field of view, and the two exchanged, per solid angle of the field of view.
 
     A factor that is not symmetric - the n^2 of one crossing only, a one-sided cosine - would show in every bin.
@@ -111,22 +96,6 @@ def test_roulette_changes_no_mean(lidar_scene, passes):
 
 
 @pytest.mark.slow
-def test_orders_of_scattering_add_up(lidar_scene, passes):
-    """Same seed: paths are only cut shorter, so each order adds light, and a high limit is none."""
-    energies = [
-        passes(lidar_scene(sea=ROUGH, integrator={"paths_per_pass": 2**13, "max_scatterings": limit}), 1)[0]
-        for limit in (0, 1, 2, 4, 1000, -1)
-    ]
-    for fewer, more in pairwise(energies):
-        assert np.all(more >= fewer * (1 - 1e-12))
-    np.testing.assert_allclose(energies[-2], energies[-1], rtol=1e-12)
-    totals = [energy.sum() for energy in energies]
-    # The water and, in the bottom echo, forward-scattered light: orders 1 and 2 are a large part of the whole.
-    assert totals[1] - totals[0] > 0.2 * totals[-1]
-    assert totals[2] - totals[1] > 0.1 * totals[-1]
-
-
-@pytest.mark.slow
 def test_symbolic_and_evaluated_loops_agree(lidar_scene, passes):
     energies = []
     for symbolic in (True, False):
@@ -135,24 +104,6 @@ def test_symbolic_and_evaluated_loops_agree(lidar_scene, passes):
     # Fused and separate kernels round differently, which now and then moves a path to the next bin.
     assert energies[0].sum() == pytest.approx(energies[1].sum(), rel=1e-3)
     assert np.mean(np.isclose(*energies, rtol=1e-3, atol=1e-24)) > 0.95
-
-
-@pytest.mark.slow
-def test_absorption_multiplies_every_bin_by_its_path_in_the_water(lidar_scene, passes):
-    """Absorption alone, without scattering, leaves the surface echo and dims the bottom by exp(-2 da L)."""
-    bottoms = []
-    for attenuation in (0.1, 0.2):
-        water = {"attenuation": attenuation, "scattering": 0.0, "backscattering": 0.0}
-        # The record ends before light comes that the bottom has reflected twice.
-        film = {"time_start_ns": 1450.0, "bin_count": 60}
-        scene = lidar_scene(water=water, film=film, integrator={"paths_per_pass": 2**13})
-        bottoms.append(passes(scene, 32).sum(axis=(1, 2)))
-    path = 8 / np.cos(np.arcsin(np.sin(np.radians(20)) / 1.34))
-    mean = [b.mean() for b in bottoms]
-    relative = np.hypot(*(b.std(ddof=1) / np.sqrt(32) / b.mean() for b in bottoms))
-    assert relative < 1e-2
-    # Rays of the beam within 5 mrad cross 0.1 % more or less water.
-    assert abs(mean[1] / mean[0] / np.exp(-0.2 * path) - 1) < largest_z(32) * relative + 1e-3
 
 
 @pytest.mark.slow

@@ -20,7 +20,6 @@ SEA = {"wind_speed": 6.0, "group_index": 1.34, "shortest_wave": 1.0, "cell_size"
 
 
 def largest_difference(first, second, passes):
-    """Return the largest |z| of energies, with its limit."""
     error = np.hypot(first["gate_energy_stderr"].values, second["gate_energy_stderr"].values)
     z = np.abs(first["gate_energy"].values - second["gate_energy"].values) / error
     return float(z.max()), largest_z(passes, z.size)

@@ -9,6 +9,7 @@ a wide view, which are their exchange (reciprocity is tested on its own): no lig
 import numpy as np
 import pytest
 from oracles.half_space import chandrasekhar_h
+from rows import each_case
 from significance import assert_equal, largest_z
 
 from mitransient_lidar.core.constants import C0
@@ -48,24 +49,20 @@ def half_space(lidar_scene, degrees, albedo, view, beam, integrator):
 
 
 def returned(lidar_scene, passes, count, degrees, albedo, view, beam, integrator):
-    """Return the energy [J] of `count` passes of a half-space."""
     scene = half_space(lidar_scene, degrees, albedo, view, beam, integrator)
     # Energies go with the solid angle that is seen.
     return passes(scene, count)[:, 0, 0] * (beam / view) ** 2
 
 
-@pytest.mark.parametrize(
-    ("albedo", "degrees"),
-    [
-        pytest.param(0.5, 0.0, marks=pytest.mark.long),
-        pytest.param(0.5, 40.0, marks=pytest.mark.long),
-        pytest.param(0.9, 20.0, marks=pytest.mark.long),
-        pytest.param(0.9, 60.0, marks=pytest.mark.slow),
-        pytest.param(0.99, 0.0, marks=pytest.mark.long),
-        pytest.param(0.99, 60.0, marks=pytest.mark.long),
-    ],
+@each_case(
+    pytest.param(0.5, 0.0, marks=pytest.mark.long),
+    pytest.param(0.5, 40.0, marks=pytest.mark.long),
+    pytest.param(0.9, 20.0, marks=pytest.mark.long),
+    pytest.param(0.9, 60.0, marks=pytest.mark.slow),
+    pytest.param(0.99, 0.0, marks=pytest.mark.long),
+    pytest.param(0.99, 60.0, marks=pytest.mark.long),
 )
-def test_reference_returns_h_squared(lidar_scene, passes, z_score, albedo, degrees):
+def test_reference_returns_h_squared(albedo, degrees, lidar_scene, passes, z_score):
     """Light of up to hundreds of scatterings; at albedo 0.99 it is 3 to 6 times the single scattering."""
     # No direction is drawn towards the laser: each such draw costs variance, and here are hundreds.
     walk = {"paths_per_pass": 2**15, "guiding_probability": 0.0, "roulette_threshold": 0.5}
@@ -78,16 +75,13 @@ def test_reference_returns_h_squared(lidar_scene, passes, z_score, albedo, degre
     assert abs(energy.mean() / expected - 1) < 5e-3
 
 
-@pytest.mark.parametrize(
-    ("integrator", "albedo", "degrees", "view", "beam"),
-    [
-        pytest.param("lidar_volpath", 0.5, 0.0, 0.1, 20.0, marks=pytest.mark.slow),
-        pytest.param("lidar_volpath", 0.9, 60.0, 0.1, 40.0, marks=pytest.mark.long),
-        pytest.param("lidar_merging", 0.5, 0.0, 4.0, 14.0, marks=pytest.mark.long),
-        pytest.param("lidar_merging", 0.9, 60.0, 5.0, 22.0, marks=pytest.mark.long),
-    ],
+@each_case(
+    pytest.param("lidar_volpath", 0.5, 0.0, 0.1, 20.0, marks=pytest.mark.slow),
+    pytest.param("lidar_volpath", 0.9, 60.0, 0.1, 40.0, marks=pytest.mark.long),
+    pytest.param("lidar_merging", 0.5, 0.0, 4.0, 14.0, marks=pytest.mark.long),
+    pytest.param("lidar_merging", 0.9, 60.0, 5.0, 22.0, marks=pytest.mark.long),
 )
-def test_derivatives_by_absorption_and_scattering(lidar_scene, integrator, albedo, degrees, view, beam):
+def test_derivatives_by_absorption_and_scattering(integrator, albedo, degrees, view, beam, lidar_scene):
     """The energy is a function of the albedo w = b / (a + b) alone, w H(mu, w)^2, since lengths do not matter.
 
     With a + b = 1 the derivatives are -w dE/dw by a at fixed b, and (1 - w) dE/dw by b at fixed a. H is differentiated

@@ -57,9 +57,6 @@ def test_only_what_is_not_merged_is_left_to_the_reference(lidar_scene, passes):
     assert passes(mirror, 2).sum() > 0
 
 
-# Statistics.
-
-
 @pytest.mark.slow
 def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
     four = passes(lidar_scene(integrator=FEW, sea=WAVES), 2, 5)
@@ -68,9 +65,6 @@ def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
     single = passes(lidar_scene(integrator=FEW, sea=WAVES, rx={"layout": "1x1"}), 2, 5)
     np.testing.assert_allclose(four.sum(axis=1), single[:, 0], rtol=1e-12, atol=1e-30)
     assert not np.array_equal(four[0], four[1])
-
-
-# Parts.
 
 
 @pytest.fixture
@@ -272,17 +266,12 @@ def test_passes_share_their_kernels(lidar_scene, integrator):
 #: Water of two refractive indices.
 STRATA = {"layer_tops": "0, 2", "attenuation": "0.6, 0.3", "scattering": "0.35, 0.15", "backscattering": "0.007, 0.003"}
 STRATA |= {"refractive_index": "1.337, 1.342", "group_index": "1.358, 1.365"}
-OTHER_STRATA = {
-    "layer_tops": "0, 3",
-    "attenuation": "0.5, 0.3",
-    "refractive_index": "1.33, 1.34",
-    "group_index": "1.35, 1.37",
-}
+OTHER_STRATA = {"layer_tops": "0, 3", "attenuation": "0.5, 0.3", "refractive_index": "1.33, 1.34"}
+OTHER_STRATA |= {"group_index": "1.35, 1.37"}
 OTHER_STRATA |= {"plume_scattering": 0.7, "plume_width": 6, "plume_depth": 1.5, "ship_x": 1}
 
 
 def kernels_of_pass(scene, sensor, integrator):
-    """Return the kernels that a pass of few paths launches."""
     renderer = choose_integrator(scene, integrator).prepare(scene, sensor)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()

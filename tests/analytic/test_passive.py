@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.half_space import phase_moments, water_leaving_reflectance
+from rows import each_case
 from scipy.integrate import quad
 from significance import largest_error, largest_z
 
@@ -67,9 +68,6 @@ def agrees(samples, expected, comparisons=1, bias=0.0):
     return error / expected
 
 
-# (a) a white plate just below the surface
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("zenith", "off_nadir", "rho"), [(0.0, 15.0, 0.9), (40.0, 35.0, 0.9)])
 def test_a_plate_just_below_the_surface(zenith, off_nadir, rho):
@@ -87,13 +85,10 @@ def test_a_plate_just_below_the_surface(zenith, off_nadir, rho):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("sea", "layers"),
-    [
-        (SMOOTH, {}),
-        (SMOOTH, {"layer_tops": "0, 0.5", "attenuation": "0.3, 0.6", "refractive_index": "1.33, 1.37"}),
-        ({"spectrum": "flat", "wind_speed": 3.0}, {}),
-    ],
+@each_case(
+    (SMOOTH, {}),
+    (SMOOTH, {"layer_tops": "0, 0.5", "attenuation": "0.3, 0.6", "refractive_index": "1.33, 1.37"}),
+    ({"spectrum": "flat", "wind_speed": 3.0}, {}),
 )
 def test_where_nothing_absorbs_everything_is_as_bright_as_the_sky(sea, layers):
     """A white bottom and water that only scatters: whatever light does, it has come from a sky of radiance 1.
@@ -136,14 +131,8 @@ def crossing(bsdf, side, off_normal_deg):
     return energy[reflected].sum() / energy.size, energy[~reflected].sum() / energy.size
 
 
-# (c) sun glint
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("zenith", "azimuth", "view", "wind", "wind_azimuth"),
-    [(30.0, 180.0, 20.0, 6.0, 0.0), (35.0, 10.0, 30.0, 4.0, 90.0)],
-)
+@each_case((30.0, 180.0, 20.0, 6.0, 0.0), (35.0, 10.0, 30.0, 4.0, 90.0))
 def test_sun_glint_of_gaussian_slopes(zenith, azimuth, view, wind, wind_azimuth):
     """Cox and Munk 1954, equation 9: L = E rho(omega) p(slope) / (4 cos(view) cos^4(tilt))."""
     scene = build(
@@ -177,9 +166,6 @@ def direction(zenith, azimuth):
     return np.array([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
 
 
-# (d) the sky's mirror image
-
-
 @pytest.mark.parametrize("view", [0.0, 70.0])
 def test_a_level_sea_mirrors_the_sky(view):
     """Fresnel's reflectance times the sky's radiance; 53 degrees is Brewster's angle, far below 4 times 2 %."""
@@ -204,8 +190,6 @@ def test_a_level_sea_mirrors_the_sky_where_it_is_seen():
         radiance = float(next(e for e in scene.emitters() if hasattr(e, "sun")).radiance(mirrored)[0])
         agrees(passes(scene, 4), float(fresnel(view, N)[0]) * radiance, 2, bias=2e-3)
 
-
-# (b) deep water
 
 WATER = {"attenuation": 1.0, "scattering": 0.9, "backscattering": 0.9 * 0.0183}
 
@@ -248,15 +232,12 @@ def test_deep_water_under_an_even_sky(albedo):
     agrees(leaving, float(water_leaving_reflectance(albedo, moments, N)), 2, bias=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("phase", "albedo", "expected", "spread"),
-    [
-        pytest.param("rayleigh", 0.9, 4.85e-2, 0.015, marks=pytest.mark.slow),
-        pytest.param("rayleigh", 0.2, 1.72e-3, 0.044, marks=pytest.mark.long),
-        # 8 s.
-        pytest.param("petzold", 0.9, 6.99e-3, 0.063, marks=pytest.mark.long),
-        pytest.param("petzold", 0.2, 5.47e-5, 0.060, marks=pytest.mark.long),
-    ],
+@each_case(
+    pytest.param("rayleigh", 0.9, 4.85e-2, 0.015, marks=pytest.mark.slow),
+    pytest.param("rayleigh", 0.2, 1.72e-3, 0.044, marks=pytest.mark.long),
+    # 8 s.
+    pytest.param("petzold", 0.9, 6.99e-3, 0.063, marks=pytest.mark.long),
+    pytest.param("petzold", 0.2, 5.47e-5, 0.060, marks=pytest.mark.long),
 )
 def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
     """Mobley et al. 1993 (doi:10.1364/AO.32.007484), problems 1 and 2: upward radiance at the nadir, one attenuation
@@ -284,6 +265,3 @@ def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
         found.append([float(record.found[0])])
     error = agrees(np.array(found), expected, 4, bias=spread)
     assert error < largest_error(8, 0.004 if ratio > 0.1 else 0.018)
-
-
-# (e) waves focus the sun

@@ -8,6 +8,7 @@ import pytest
 import significance
 from oracles.beam_average import echo_energies
 from oracles.refracted_path import refracted_path
+from rows import each_case
 from significance import largest_z, mean_and_error
 
 from mitransient_lidar.core.constants import C0
@@ -39,9 +40,6 @@ def plate(x, y, z, half, bsdf, tilt=0.0):
     return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
 
 
-# Closed forms.
-
-
 def gain(x, y, z, lidar=LIDAR, sigma=SIGMA):
     """Return what the lidar makes of a small target at (x, y, z) in still, clear water.
 
@@ -69,7 +67,6 @@ def gain(x, y, z, lidar=LIDAR, sigma=SIGMA):
 
 
 def grid(low, high, count):
-    """Return midpoints and spacing."""
     step = (high - low) / count
     return low + step * (np.arange(count) + 0.5), step
 
@@ -117,10 +114,10 @@ def echo_of(sphere):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize(
-    "sphere", [pytest.param(name, marks=pytest.mark.slow if name == STEEPEST else pytest.mark.long) for name in SPHERES]
+@each_case(
+    *zip([pytest.param(name, marks=pytest.mark.slow if name == STEEPEST else pytest.mark.long) for name in SPHERES])
 )
-def test_sphere_in_clear_water(lidar_scene, passes, integrator, sphere):
+def test_sphere_in_clear_water(sphere, lidar_scene, passes, integrator):
     """Energy and mean time against quadrature over the sphere's lit cap, which is also the one that is seen."""
     (lidar, sigma, centre, radius), (energy, time) = SPHERES[sphere], echo_of(sphere)
     pose = {"altitude": lidar.height, "off_nadir_deg": float(np.degrees(lidar.off_nadir))}
@@ -211,9 +208,6 @@ def test_opposition_effect_brightens_a_level_bottom(lidar_scene, passes, integra
     # Slopes of 0.003 turn light and view 0.001 rad apart, 0.1 % of the peak's height, and the beam is 0.008 rad wide.
     assert abs(ratio - expected) < largest_z(16) * error + 2e-3 * expected
     assert expected > 1.5
-
-
-# Published figures 13 and 14.
 
 
 @pytest.mark.slow

@@ -29,8 +29,6 @@ INTEGRATORS = ["lidar_merging", "lidar_volpath"]
 
 @pytest.fixture
 def build(lidar_scene):
-    """Builder of scenes with a lidar under water."""
-
     def scene(
         altitude,
         off_nadir_deg,

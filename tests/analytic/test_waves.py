@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from oracles.beam_average import echo_energies
 from oracles.two_scale import two_scale_ratio
+from rows import each_case
 from significance import largest_z
 
 from mitransient_lidar.physics.lidar.level_sea import LidarSystem
@@ -21,14 +22,8 @@ def surface_echoes(wind, angle, wave):
     film = {"type": "time_gated_film", "time_start_ns": 12000.0, "bin_width_ns": 6000.0, "bin_count": 1}
     energies = []
     for seed in range(SEAS):
-        sea = {
-            "type": "ocean_surface",
-            "wind_speed": wind,
-            "cell_size": 0.25,
-            "shortest_wave": wave,
-            "refined_size": 96.0,
-            "surface_seed": seed,
-        }
+        sea = {"type": "ocean_surface", "wind_speed": wind, "cell_size": 0.25, "shortest_wave": wave}
+        sea |= {"refined_size": 96.0, "surface_seed": seed}
         scene = mi.load_dict(
             {
                 "type": "scene",
@@ -43,15 +38,12 @@ def surface_echoes(wind, angle, wave):
     return np.array(energies), surface.resolved_variance, surface.ripple_variance
 
 
-@pytest.mark.parametrize(
-    ("wind", "angle"),
-    [
-        pytest.param(6.0, 20.0, marks=pytest.mark.slow),
-        *(
-            pytest.param(wind, angle, marks=pytest.mark.long)
-            for wind, angle in ((3.0, 0.0), (3.0, 10.0), (3.0, 20.0), (6.0, 0.0), (10.0, 0.0), (10.0, 20.0))
-        ),
-    ],
+@each_case(
+    pytest.param(6.0, 20.0, marks=pytest.mark.slow),
+    *(
+        pytest.param(wind, angle, marks=pytest.mark.long)
+        for wind, angle in ((3.0, 0.0), (3.0, 10.0), (3.0, 20.0), (6.0, 0.0), (10.0, 0.0), (10.0, 20.0))
+    ),
 )
 def test_mean_surface_echo_is_that_of_the_slopes_that_the_sea_states(wind, angle):
     """Within 5 % of Gaussian slopes but in the tail at light wind, where ripples on facets are 20 % brighter.

@@ -216,7 +216,6 @@ def _histogram(
 
 
 def _edges(edges_ns: npt.ArrayLike) -> FloatArray:
-    """Return valid edges of time bins."""
     edges = finite_array("edges_ns", edges_ns)
     if edges.ndim != 1 or edges.size < 2 or np.any(np.diff(edges) <= 0):
         raise ValueError(f"edges_ns of shape {edges.shape} must be a strictly increasing list of at least 2 times")

@@ -15,7 +15,6 @@ def transmission(shape, t_ns):
 
 
 def _edge(t, rise):
-    """Return an edge from 0 to 1, half open at t = 0."""
     if rise == 0:
         return np.where(t >= 0, 1.0, 0.0)
     return np.sin(0.5 * np.pi * np.clip(t / (EDGE_PER_RISE * rise) + 0.5, 0, 1)) ** 2

@@ -157,7 +157,7 @@ def test_beam_samples_keep_the_energy(kind, view_mrad, tmp_path):
         assert error < 2e-3
 
 
-@each_row("count", [1, 3, 17])
+@each_row(1, 3, 17)
 def test_any_number_of_photons_keeps_the_energy(count):
     """Sums of the energies of few photons, of which some are drawn over a small view."""
     sampler = BeamSampler(laser(), mi.load_dict({"type": "multipixel_receiver", "field_of_view_mrad": 2.0}).receiver)
@@ -170,16 +170,13 @@ def test_any_number_of_photons_keeps_the_energy(count):
 
 
 @each_row(
-    ("image", "message"),
-    [
-        (np.zeros((3, 3)), "zeros only"),
-        (np.array([[1.0, -2.0]]), "holds -2 but no irradiance may be negative"),
-        (np.array([[1.0, np.nan]]), "must hold finite numbers"),
-        (np.ones((2, 2, 3)), r"has the shape \(2, 2, 3\)"),
-        (np.ones((1, 3000)), r"shape \(1, 3000\) must have two dimensions of 1 to 2048"),
-        (np.ones((0, 3)), r"has the shape \(0, 3\)"),
-        (np.array([["a", "b"]]), "must hold real numbers"),
-    ],
+    (np.zeros((3, 3)), "zeros only"),
+    (np.array([[1.0, -2.0]]), "holds -2 but no irradiance may be negative"),
+    (np.array([[1.0, np.nan]]), "must hold finite numbers"),
+    (np.ones((2, 2, 3)), r"has the shape \(2, 2, 3\)"),
+    (np.ones((1, 3000)), r"shape \(1, 3000\) must have two dimensions of 1 to 2048"),
+    (np.ones((0, 3)), r"has the shape \(0, 3\)"),
+    (np.array([["a", "b"]]), "must hold real numbers"),
 )
 def test_images_that_are_no_beam_are_refused(image, message, tmp_path):
     with pytest.raises(RuntimeError, match=message):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import significance
 from frequencies import assert_counts
+from rows import each_case
 from scipy.special import erf
 from significance import assert_same, largest_z
 
@@ -42,14 +43,11 @@ def gaussian_shares(centre, sigma, edges):
     return x[::-1, None] * y[::-1]
 
 
-@pytest.mark.parametrize(
-    ("divergence", "shift", "blur", "footprint"),
-    [
-        (0.1, 0.7, 1.5, True),  # nearly a point, off the middle
-        (4.0, 0.7, 3.0, True),  # beam and blur alike
-        (0.1, 2.1, 4.0, True),  # 9.9 mrad off the axis: only blur brings the light into the field of view
-        (10.0, 4.2, 2.0, False),  # 20 mrad off the axis: too little to sample the footprint
-    ],
+@each_case(
+    (0.1, 0.7, 1.5, True),  # nearly a point, off the middle
+    (4.0, 0.7, 3.0, True),  # beam and blur alike
+    (0.1, 2.1, 4.0, True),  # 9.9 mrad off the axis: only blur brings the light into the field of view
+    (10.0, 4.2, 2.0, False),  # 20 mrad off the axis: too little to sample the footprint
 )
 def test_gaussian_blur_spreads_a_beam_as_its_integral_over_pixels(divergence, shift, blur, footprint):
     mean, error, view = energies({**SQUARE, "blur_mrad": blur}, {"divergence_mrad": divergence, "aim_y": shift})

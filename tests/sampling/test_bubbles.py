@@ -118,7 +118,6 @@ ALIKE = {**HG, "plume_phase": {"type": "hg", "g": 0.9}}
 
 
 def energies(lidar_scene, passes, integrator, film, *waters):
-    """Return the energies of gates in passes, of each water."""
     engine = {"type": integrator, "paths_per_pass": 2**14}
     if integrator == "lidar_merging":
         engine["photons_per_pass"] = 2**14

@@ -119,9 +119,9 @@ def test_overlapping_pixels_each_get_their_whole_field(caplog):
         assert abs(samples.mean() - field.area) < largest_z(COUNT, 2) * error
 
 
-@each_row("name", SHAPES)
-@each_row("reach", [0.1 * MRAD, 3 * MRAD])
-def test_no_point_of_a_field_is_out_of_its_reach(name, reach):
+@each_row(*zip(SHAPES))
+@each_row(0.1 * MRAD, 3 * MRAD)
+def test_no_point_of_a_field_is_out_of_its_reach(reach, name):
     """Points up to `reach` from points of the field are near it, and few of those twice as far from all of them are."""
     field = SHAPES[name]
     rng = np.random.default_rng(8)

@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_case
 from significance import assert_same
 
 HG = {"type": "hg", "g": 0.6}
@@ -48,14 +49,11 @@ def assert_same_light(first, second):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("change", "phase"),
-    [
-        ({"phase": HG}, HG),
-        ({"phase_function": "hg", "phase_g": 0.6}, HG),
-        ({"phase_function": "petzold"}, {"type": "petzold"}),
-        ({}, {"type": "fournier_forand", "backscatter_ratio": 0.04}),
-    ],
+@each_case(
+    ({"phase": HG}, HG),
+    ({"phase_function": "hg", "phase_g": 0.6}, HG),
+    ({"phase_function": "petzold"}, {"type": "petzold"}),
+    ({}, {"type": "fournier_forand", "backscatter_ratio": 0.04}),
 )
 def test_volpath_sees_homogeneous_water_as_mitsubas_medium(change, phase):
     """Albedo for scattering would be 1.7 times the light; water without a phase function 3 to 10 times."""
@@ -117,17 +115,14 @@ WIDE = {"type": "hg", "g": 0.5}
 BLEND = {"type": "blendphase", "weight": 0.3, "phase_0": {"type": "hg", "g": 0.5}, "phase_1": {"type": "rayleigh"}}
 
 
-@pytest.mark.parametrize(
-    "phase",
-    [
-        # Part of the blend.
-        pytest.param({"type": "rayleigh"}, marks=pytest.mark.long),
-        pytest.param(BLEND, marks=pytest.mark.slow),
-        pytest.param({"type": "isotropic"}, marks=pytest.mark.long),
-        pytest.param({"type": "two_term_henyey_greenstein"}, marks=pytest.mark.slow),
-    ],
+@each_case(
+    # Part of the blend.
+    pytest.param({"type": "rayleigh"}, marks=pytest.mark.long),
+    pytest.param(BLEND, marks=pytest.mark.slow),
+    pytest.param({"type": "isotropic"}, marks=pytest.mark.long),
+    pytest.param({"type": "two_term_henyey_greenstein"}, marks=pytest.mark.slow),
 )
-def test_column_follows_the_phase_function_at_180_degrees(lidar_scene, passes, homogeneous, phase):
+def test_column_follows_the_phase_function_at_180_degrees(phase, lidar_scene, passes, homogeneous):
     """The closed form at 180 degrees against that of Henyey-Greenstein, for Mitsuba's own phase functions too."""
     backward = {
         "rayleigh": 3 / (8 * np.pi),

@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from kernel_arrays import array, vector
+from rows import each_case
 from significance import assert_equal, assert_same
 
 from mitransient_lidar.loading.scenes import open_scene
@@ -109,10 +110,7 @@ def test_facet_slopes_have_the_stated_variance_along_and_across_the_wind():
     assert_equal(ratios, [1, 1], error=0.012)
 
 
-@pytest.mark.parametrize(
-    ("asked", "total"),
-    [("cox_munk", sum(cox_munk(6.0))), ("spectrum", sum(ElfouhailySpectrum(6.0).slope_variance())), ("0.1", 0.1)],
-)
+@each_case(("cox_munk", sum(cox_munk(6.0))), ("spectrum", sum(ElfouhailySpectrum(6.0).slope_variance())), ("0.1", 0.1))
 def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, total):
     _, shape = surface(wind_speed=6.0, slope_variance=asked, **PATCH)
     assert shape.sea.slope_variance == pytest.approx(total, rel=1e-9)
@@ -121,9 +119,6 @@ def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, tota
     for axis, variance in zip("uv", shape.sea.ripple_variance, strict=True):
         # Beckmann's alpha is sqrt(2) standard deviations of Gaussian slopes.
         assert parameters[f"bsdf.alpha_{axis}.value"][0] == pytest.approx(np.sqrt(2 * variance), rel=1e-6)
-
-
-# The patch and what surrounds it.
 
 
 @pytest.mark.slow
@@ -184,14 +179,8 @@ def test_time_moves_the_sea_downwind():
 @pytest.mark.slow
 def test_any_mesh_with_water_below_it_is_a_sea(lidar_scene, passes, tmp_path):
     """The sea written to a PLY file and read by Mitsuba's plugin: the same paths, the same energies."""
-    sea = {
-        "ripple_focusing": False,
-        "spectrum": "elfouhaily",
-        "slope_variance": "cox_munk",
-        "refined_size": 16.0,
-        "cell_size": 0.25,
-        "size": 100.0,
-    }
+    sea = {"ripple_focusing": False, "spectrum": "elfouhaily", "slope_variance": "cox_munk", "refined_size": 16.0}
+    sea |= {"cell_size": 0.25, "size": 100.0}
     own = lidar_scene(sea=sea, integrator={"paths_per_pass": 2**14})
     shape = next(shape for shape in own.shapes() if hasattr(shape, "sea"))
     shape.write_ply(str(tmp_path / "sea.ply"))

@@ -138,7 +138,7 @@ def test_mean_cosine_and_backscatter_ratio(name):
     assert abs(np.mean(theta > np.pi / 2) - backscatter_ratio) < limit * error + 5e-6
 
 
-@each_row("name", PLUGINS)
+@each_row(*zip(PLUGINS))
 def test_value_is_density_and_sampling_reports_it(name):
     plugin, _, wo, pdf = sample_angles(name, 10_000)
     value, density = plugin.eval_pdf(mi.PhaseFunctionContext(), interaction(), wo)
@@ -149,14 +149,11 @@ def test_value_is_density_and_sampling_reports_it(name):
 
 
 @each_row(
-    ("name", "reference"),
-    [
-        ("fournier_forand", lambda t: closed_form.fournier_forand(t, *closed_form.fournier_forand_parameters(0.04))),
-        ("petzold", lambda t: closed_form.petzold_average_particle()(t)),
-        ("sea_water", lambda t: 3 / (4 * np.pi * (3 + 0.925)) * (1 + 0.925 * np.cos(t) ** 2)),
-        ("two_term", lambda t: two_term_henyey_greenstein(t, 0.95, 0.9, 0.3)),
-        ("hg", lambda t: henyey_greenstein(t, 0.924)),
-    ],
+    ("fournier_forand", lambda t: closed_form.fournier_forand(t, *closed_form.fournier_forand_parameters(0.04))),
+    ("petzold", lambda t: closed_form.petzold_average_particle()(t)),
+    ("sea_water", lambda t: 3 / (4 * np.pi * (3 + 0.925)) * (1 + 0.925 * np.cos(t) ** 2)),
+    ("two_term", lambda t: two_term_henyey_greenstein(t, 0.95, 0.9, 0.3)),
+    ("hg", lambda t: henyey_greenstein(t, 0.924)),
 )
 def test_value_is_the_closed_form(name, reference):
     """From 0.1 degree to 180; Petzold's kinks at tabulated angles are rounded off by the finer table."""

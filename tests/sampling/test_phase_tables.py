@@ -1,4 +1,4 @@
-"""Phase functions as plugins: normalised on the sphere, and the published tables at every angle."""
+"""Phase functions as plugins: normalised, the published tables at every angle, and tables of users."""
 
 from importlib import resources
 
@@ -6,23 +6,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
-from rows import each_row
+from oracles.phase import henyey_greenstein
+from rows import each_case, each_row
 from significance import largest_z
 
 from mitransient_lidar.transport.medium import tabulated_phase
 
 FRAME_WI = np.array([0.48, -0.6, 0.64])
 
-#: Fournier-Forand family by bb/b: mean cosine, p(90 degrees) and p(180 degrees) of the closed form. The mean cosine is
-#: 1 - 2 <s> from the cumulative distribution: a quadrature of p from 1e-9 rad loses 1.1e-3 in the core at bb/b = 0.005.
-FOURNIER_FORAND = {
-    0.005: (0.97655, 1.23315e-3, 7.2867e-4),
-    0.0183: (0.93000, 4.190592e-3, 2.855692e-3),
-    0.04: (0.86658, 8.564872e-3, 6.613178e-3),
-    0.05: (0.83992, 1.045472e-2, 8.429564e-3),
-}
 PLUGINS = [
-    *({"type": "fournier_forand", "backscatter_ratio": ratio} for ratio in FOURNIER_FORAND),
+    *({"type": "fournier_forand", "backscatter_ratio": ratio} for ratio in (0.005, 0.0183, 0.04, 0.05)),
     {"type": "fournier_forand", "refractive_index": 1.175, "junge_slope": 4.065},
     {"type": "petzold"},
     {"type": "two_term_henyey_greenstein", "weight": 0.95, "g_forward": 0.9, "g_backward": 0.3},
@@ -40,7 +33,7 @@ def value(plugin, theta):
     return np.array(plugin.eval_pdf(mi.PhaseFunctionContext(), mei, wo)[1], dtype=np.float64)
 
 
-@each_row("description", PLUGINS)
+@each_row(*zip(PLUGINS))
 def test_normalised_over_the_sphere(description):
     """Quadrature in ln(theta) from 0.003 degree, plus the power law below: one half, or 4 pi, would be off by far."""
     plugin = mi.load_dict(description)
@@ -58,20 +51,7 @@ def test_normalised_over_the_sphere(description):
     assert total == pytest.approx(1, abs=3e-3)
 
 
-@pytest.mark.parametrize("ratio", FOURNIER_FORAND)
-def test_fournier_forand_family(ratio):
-    """The table of the family n = 1.01 + 0.1542 (mu - 3); another line through the plane of index and slope differs."""
-    mean_cosine, side, back = FOURNIER_FORAND[ratio]
-    plugin = mi.load_dict({"type": "fournier_forand", "backscatter_ratio": ratio})
-    np.testing.assert_allclose(value(plugin, np.radians([90.0, 180.0])), [side, back], rtol=5e-4)
-    assert plugin.tabulated.table.mean_cosine == pytest.approx(mean_cosine, abs=2e-5)
-    assert plugin.tabulated.table.backscatter_ratio == pytest.approx(ratio, rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("index", "slope", "ratio"),
-    [(1.040, 3.2010, 1.003e-3), (1.08, 3.483, 1.0037e-2), (1.175, 4.065, 0.10008), (1.15, 4.874, 0.40052)],
-)
+@each_case((1.040, 3.2010, 1.003e-3), (1.08, 3.483, 1.0037e-2), (1.175, 4.065, 0.10008), (1.15, 4.874, 0.40052))
 def test_fournier_forand_by_index_and_slope(index, slope, ratio):
     """Pairs that the Ocean Optics Web Book lists with their backscatter ratios."""
     plugin = mi.load_dict({"type": "fournier_forand", "refractive_index": index, "junge_slope": slope})
@@ -99,14 +79,11 @@ def test_petzold_at_every_tabulated_angle():
     assert core == pytest.approx(0.05169 / 0.9929, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    "description",
-    [
-        {"type": "fournier_forand", "backscatter_ratio": 0.005},
-        {"type": "fournier_forand", "backscatter_ratio": 0.0183},
-        {"type": "petzold", "water": "clear"},
-        {"type": "sea_water"},
-    ],
+@each_case(
+    {"type": "fournier_forand", "backscatter_ratio": 0.005},
+    {"type": "fournier_forand", "backscatter_ratio": 0.0183},
+    {"type": "petzold", "water": "clear"},
+    {"type": "sea_water"},
 )
 def test_short_segments_are_sampled_as_the_power_laws_they_are(description, monkeypatch):
     """The series against logarithm and exponential, whose own rounding grows where an exponent is close to 1."""
@@ -131,3 +108,53 @@ def test_short_segments_are_sampled_as_the_power_laws_they_are(description, monk
     np.testing.assert_allclose(found[within], value[within], rtol=3e-5)
     below = np.mean(s < 1e-12)
     assert abs(below - series.table.cdf[0]) < largest_z(count) * np.sqrt(series.table.cdf[0] / count) + 10 / count
+
+
+G = 0.9
+WI = np.array([0.3, -0.5, 0.8124]) / np.linalg.norm([0.3, -0.5, 0.8124])
+
+
+@pytest.fixture
+def table(tmp_path):
+    """Henyey-Greenstein at 400 uneven angles, as a volume scattering function of b = 0.4 /m."""
+    angle = np.concatenate([np.geomspace(0.05, 10, 200), np.linspace(10.4, 180, 200)])
+    path = tmp_path / "measured.csv"
+    value = 0.4 * henyey_greenstein(np.radians(angle), G)
+    path.write_text("angle, vsf\n" + "\n".join(f"{a:.6f}, {v:.8g}" for a, v in zip(angle, value, strict=True)))
+    return str(path)
+
+
+def interaction():
+    mei = mi.MediumInteraction3f()
+    mei.wi = mi.Vector3f(WI.tolist())
+    mei.sh_frame = mi.Frame3f(mei.wi)
+    return mei
+
+
+def test_samples_and_values_are_those_of_the_function_in_the_table(table, caplog):
+    plugin = mi.load_dict({"type": "measured_phase", "filename": table})
+    assert "the values integrate to 0.4 over the sphere" in caplog.text
+    assert plugin.backscatter_ratio == pytest.approx(0.022903, rel=5e-3)
+    count = 400_000
+    rng = mi.PCG32(count, initstate=3 + significance.seed_shift)
+    first, pair = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    wo, weight, pdf = plugin.sample(mi.PhaseFunctionContext(), interaction(), first, pair)
+    cosine = -(np.array(wo).T @ WI)
+    assert np.all(np.array(weight) == 1)
+    error = cosine.std() / np.sqrt(count)
+    # The opposite orientation would give -0.9; a table read in radians nothing like it.
+    # 3e-4 for the table, whose first angle is 0.05 degrees.
+    assert abs(cosine.mean() - G) < largest_z(count) * error + 3e-4
+    expected = henyey_greenstein(np.arccos(np.clip(cosine, -1, 1)), G)
+    np.testing.assert_allclose(np.array(pdf), expected, rtol=0.02)
+    value, density = plugin.eval_pdf(mi.PhaseFunctionContext(), interaction(), wo)
+    np.testing.assert_allclose(np.array(value)[0], np.array(density))
+
+
+def test_invalid_input_is_refused(tmp_path):
+    with pytest.raises(RuntimeError, match="filename is missing"):
+        mi.load_dict({"type": "measured_phase"})
+    path = tmp_path / "short.csv"
+    path.write_text("0.1, 5\n90, 1\n180, 0.5\n")
+    with pytest.raises(RuntimeError, match="10"):
+        mi.load_dict({"type": "measured_phase", "filename": str(path)})

@@ -92,7 +92,6 @@ def test_leaf_returns_its_shares():
 
 def test_refuses_other_plants():
     for parameters, said in (
-        ({"leaf_area_index": 0.0}, "leaf_area_index = 0"),
         ({"height": 6.0}, "height = 6 of plants lets them rise"),
         ({"leaf_width": 0.6}, "leaf_width = 0.6 must be at most height = 0.5"),
         ({"form": "leaves", "shoot_density": 3.0}, "shoot_density = 3 needs blades"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import significance
 from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
-from rows import each_row
+from rows import each_case, each_row
 from significance import assert_distribution, largest_z
 
 OBLIQUE = np.array([0.5, -0.3, 0.6]) / np.linalg.norm([0.5, -0.3, 0.6])
@@ -32,9 +32,7 @@ def direction(theta, phi=0.0):
     return np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
 
 
-@pytest.mark.parametrize(
-    ("wi", "width", "share"), [(OBLIQUE, 20.0, 0.0), (GRAZING, 8.0, 0.3), (OBLIQUE, 120.0, 0.5), (GRAZING, 120.0, 0.0)]
-)
+@each_case((OBLIQUE, 20.0, 0.0), (GRAZING, 8.0, 0.3), (OBLIQUE, 120.0, 0.5), (GRAZING, 120.0, 0.0))
 def test_samples_follow_the_density(wi, width, share):
     parameters = {"type": "retroreflector", "width_deg": width, "diffuse_share": share}
     sample, pdf = BSDFAdapter("retroreflector", parameters, wi=wi.tolist())
@@ -55,7 +53,7 @@ def test_lobe_of_narrow_width_is_gaussian():
     assert value(bsdf, OBLIQUE, aside) == pytest.approx(peak * np.exp(-0.5), rel=1e-3)
 
 
-@each_row("width", [5.0, 40.0, 180.0])
+@each_row(5.0, 40.0, 180.0)
 def test_is_reciprocal(width):
     bsdf = surface(width_deg=width, diffuse_share=0.2)
     for first, second in ((direction(0.2), direction(0.3, 0.1)), (direction(1.2, 1.0), direction(1.4, 1.3))):
@@ -65,9 +63,7 @@ def test_is_reciprocal(width):
         assert there > 0
 
 
-@pytest.mark.parametrize(
-    ("theta", "width", "share"), [(0.0, 4.0, 0.0), (0.8, 4.0, 0.4), (1.5, 30.0, 0.2), (0.0, 180.0, 0.0)]
-)
+@each_case((0.0, 4.0, 0.0), (0.8, 4.0, 0.4), (1.5, 30.0, 0.2), (0.0, 180.0, 0.0))
 def test_returns_no_more_than_the_reflectance(theta, width, share):
     """Mean weight of samples against midpoint quadrature of the values about the direction back."""
     bsdf = surface(reflectance=0.9, width_deg=width, diffuse_share=share)

@@ -99,14 +99,10 @@ def test_lambertian_model_is_the_diffuse_surface_of_mitsuba(reflectance, expecte
 
 
 @each_row(
-    ("parameters", "message"),
-    [
-        ({"reflectance": "mud"}, "reflectance = 'mud' must be a number from 0 to 1, or one of coral_sand"),
-        ({"reflectance": -0.1}, "reflectance = -0.1 must lie between 0 and 1"),
-        ({"single_scattering_albedo": 1.0}, "single_scattering_albedo = 1 must be less with these particles"),
-        ({"reflectance": 0.2, "single_scattering_albedo": 0.5}, "reflectance = 0.2 and single_scattering_albedo = 0.5"),
-        ({"model": "lambertian", "single_scattering_albedo": 0.5}, "single_scattering_albedo = 0.5 needs model"),
-    ],
+    ({"reflectance": "mud"}, "reflectance = 'mud' must be a number from 0 to 1, or one of coral_sand"),
+    ({"single_scattering_albedo": 1.0}, "single_scattering_albedo = 1 must be less with these particles"),
+    ({"reflectance": 0.2, "single_scattering_albedo": 0.5}, "reflectance = 0.2 and single_scattering_albedo = 0.5"),
+    ({"model": "lambertian", "single_scattering_albedo": 0.5}, "single_scattering_albedo = 0.5 needs model"),
 )
 def test_invalid_input_is_refused(parameters, message):
     with pytest.raises(RuntimeError, match=message):

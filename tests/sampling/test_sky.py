@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
+from rows import each_case
 from significance import largest_z
 
 COUNT = 2**20
@@ -25,15 +26,12 @@ def radiance(emitter, zenith, azimuth):
     return float(emitter.radiance(unit(zenith, azimuth))[0])
 
 
-@pytest.mark.parametrize(
-    "sky",
-    [
-        {"distribution": "uniform"},
-        {"distribution": "overcast"},
-        {"sun_zenith_deg": 0.0},
-        {"sun_zenith_deg": 40.0, "sun_azimuth_deg": 30.0},
-        {"sun_zenith_deg": 85.0},
-    ],
+@each_case(
+    {"distribution": "uniform"},
+    {"distribution": "overcast"},
+    {"sun_zenith_deg": 0.0},
+    {"sun_zenith_deg": 40.0, "sun_azimuth_deg": 30.0},
+    {"sun_zenith_deg": 85.0},
 )
 def test_the_sky_gives_its_irradiance(sky):
     """Over directions even in solid angle: neither the normalisation's quadrature nor the plugin's own samples."""
@@ -111,12 +109,9 @@ def test_mitsubas_path_tracer_sees_a_plate_in_sun_and_sky():
     assert image.std() / 8 < 0.01 * expected
 
 
-@pytest.mark.parametrize(
-    ("plugin", "message"),
-    [
-        ({"type": "sky", "distribution": "overcast"}, "irradiance is missing"),
-        ({"type": "sky", "distribution": "uniform", "irradiance": 1.0, "sun_zenith_deg": 3.0}, "leave it out"),
-    ],
+@each_case(
+    ({"type": "sky", "distribution": "overcast"}, "irradiance is missing"),
+    ({"type": "sky", "distribution": "uniform", "irradiance": 1.0, "sun_zenith_deg": 3.0}, "leave it out"),
 )
 def test_invalid_input_is_refused(plugin, message):
     with pytest.raises(RuntimeError, match=message):

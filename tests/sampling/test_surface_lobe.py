@@ -30,9 +30,9 @@ def random_points(seed):
     return mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
-@each_row("angle", [0.0, 20.0, 40.0])
-@each_row("point", [(0.0, 0.0, 0.0), (3.0, -2.0, 0.0), (0.0, 0.0, 0.2)])
-def test_at_the_surface_the_laser_is_straight_ahead(angle, point):
+@each_row(0.0, 20.0, 40.0)
+@each_row(((0.0, 0.0, 0.0),), ((3.0, -2.0, 0.0),), ((0.0, 0.0, 0.2),))
+def test_at_the_surface_the_laser_is_straight_ahead(point, angle):
     """At z = 0, and in a crest above it: the line to the laser, refracted where the point is."""
     lobe = lobe_at(angle)
     laser = lobe.direction_from(mi.Point3f(vector(point)))

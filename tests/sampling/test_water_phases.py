@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import significance
-from rows import each_row
+from rows import each_case, each_row
 from significance import largest_z
 
 from mitransient_lidar.physics.water import phase as closed_form
@@ -40,7 +40,7 @@ def test_water_and_particles_are_mixed_by_their_scattering():
 NAMED = [("jerlov", "I"), ("jerlov", "1C"), ("chlorophyll", "0.1"), ("kd", "0.06"), ("secchi", "25")]
 
 
-@each_row(("kind", "value"), NAMED)
+@each_row(*NAMED)
 def test_waters_by_name_have_molecules_and_particles(kind, value):
     """Zhang's molecules [1/m] at 532 nm, and particles with the rest of b and of bb."""
     found, molecules = water_of(kind, value), 0.001962
@@ -52,9 +52,9 @@ def test_waters_by_name_have_molecules_and_particles(kind, value):
     assert water.phases.phases[0].backscatter_ratio == pytest.approx(found.backscatter_ratio, rel=3e-3)
 
 
-@each_row(("kind", "value"), NAMED)
-@each_row("own", [{"phase_function": "petzold"}, {"phase": {"type": "petzold"}}])
-def test_given_phase_functions_include_the_molecules_of_waters_by_name(kind, value, own):
+@each_row(*NAMED)
+@each_row({"phase_function": "petzold"}, {"phase": {"type": "petzold"}})
+def test_given_phase_functions_include_the_molecules_of_waters_by_name(own, kind, value):
     water = mi.load_dict({"type": "layered_water", kind: value, **own}).water
     plain = values(mi.load_dict({"type": "petzold"}))
     np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), plain, rtol=1e-6)
@@ -72,9 +72,7 @@ def test_molecules_of_layers_by_name_follow_their_wavelength():
         np.testing.assert_allclose(values(one), expected, rtol=2e-3)
 
 
-@pytest.mark.parametrize(
-    "own", [{}, {"phase_function": "petzold"}, {"phase_function": "hg"}, {"phase": {"type": "rayleigh"}}]
-)
+@each_case({}, {"phase_function": "petzold"}, {"phase_function": "hg"}, {"phase": {"type": "rayleigh"}})
 def test_chi_changes_what_is_near_180_degrees(own):
     plain, changed = (mi.load_dict({"type": "layered_water", **own, **chi}).water for chi in ({}, {"chi_p": 0.5}))
     before, after = (values(water.phases.at(mi.UInt32(0))) for water in (plain, changed))
@@ -169,15 +167,12 @@ def test_samples_of_the_table_follow_each_function():
 
 
 @each_row(
-    ("parameters", "message"),
-    [
-        ({"water_scattering": 0.2}, "water_scattering = 0.2 must be at least 0 and at most scattering = 0.15"),
-        ({"water_scattering": "0.1, 0.1"}, "water_scattering has 2 values but must have 1 or 1"),
-        ({"water_scattering": 0.0022, "backscattering": 0.001}, "backscattering = 0.001 must be at least half of"),
-        ({"chi_p": "1, 1"}, "chi_p has 2 values but must have 1 or 1"),
-        ({"backscattering": 0.0}, "backscatter_ratio = 0 must lie between"),
-        ({"refractive_index": "1.3, 1.4"}, "refractive_index has 2 values but must have 1 or 1"),
-    ],
+    ({"water_scattering": 0.2}, "water_scattering = 0.2 must be at least 0 and at most scattering = 0.15"),
+    ({"water_scattering": "0.1, 0.1"}, "water_scattering has 2 values but must have 1 or 1"),
+    ({"water_scattering": 0.0022, "backscattering": 0.001}, "backscattering = 0.001 must be at least half of"),
+    ({"chi_p": "1, 1"}, "chi_p has 2 values but must have 1 or 1"),
+    ({"backscattering": 0.0}, "backscatter_ratio = 0 must lie between"),
+    ({"refractive_index": "1.3, 1.4"}, "refractive_index has 2 values but must have 1 or 1"),
 )
 def test_errors(parameters, message):
     with pytest.raises(RuntimeError, match=message):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from command_line import assert_refused, run
 from few_paths import few_paths
+from rows import must_refuse
 from same_bits import assert_same_bits
 
 import mitransient_lidar
@@ -96,11 +97,9 @@ def test_scenes_of_python_give_the_same_bits_with_their_files_alone(own, folder)
     assert (file["plugin"], file["name"]) == ("layered_water", str(path))
     text = path.read_text()
     path.write_text(text.replace("0.3", "0.31"))
-    with pytest.raises(UserError, match=r"profile\.csv has changed since the result was rendered"):
-        mitransient_lidar.render(first)
+    must_refuse(r"profile\.csv has changed since the result was rendered", mitransient_lidar.render, first)
     path.unlink()
-    with pytest.raises(UserError, match=r"profile\.csv is missing"):
-        mitransient_lidar.render(first)
+    must_refuse(r"profile\.csv is missing", mitransient_lidar.render, first)
     path.write_text(text)
     assert_same_bits(first, mitransient_lidar.render(first))
 
@@ -108,7 +107,6 @@ def test_scenes_of_python_give_the_same_bits_with_their_files_alone(own, folder)
 @pytest.mark.slow
 @pytest.mark.parametrize("place", ["first"])
 def test_a_camera_beside_the_receiver_is_left_alone(own, tmp_path, place):
-    """Before the receiver it was taken for it, and its film could not be recorded."""
     looking = mi.ScalarTransform4f().look_at([0, 0, 90], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 8, "height": 6, "pixel_format": "luminance"}
     camera = {"camera": {"type": "perspective", "to_world": looking, "film": film}}
@@ -125,7 +123,6 @@ def test_a_camera_beside_the_receiver_is_left_alone(own, tmp_path, place):
 @pytest.mark.slow
 @pytest.mark.parametrize("function", [mitransient_lidar.render])
 def test_a_result_of_another_receiver_gives_the_same_bits(function, tmp_path):
-    """The first one was rendered, whatever was asked for."""
     poses = '<float name="aim_x" value="$aim_x"/><float name="aim_y" value="$aim_y"/>'
     receivers = "".join(
         f'<sensor type="multipixel_receiver" id="{name}"><string name="layout" value="1x{number}"/>{poses}'
@@ -164,8 +161,7 @@ def test_textures_give_the_same_bits(tmp_path):
     assert_same_bits(render_again(tmp_path / "result.nc"), result)
     assert json.loads(result.attrs["scene_files"])[1]["path"] == str(picture.resolve())
     picture.write_bytes(picture.read_bytes() + b" ")
-    with pytest.raises(UserError, match=r"grey.png has changed"):
-        render_again(tmp_path / "result.nc")
+    must_refuse(r"grey.png has changed", render_again, tmp_path / "result.nc")
     elsewhere.mkdir()
     (elsewhere / "grey.png").write_bytes(picture.read_bytes()[:-1])
     assert_same_bits(render_again((tmp_path / "result.nc").rename(elsewhere / "result.nc")), result)
@@ -206,14 +202,11 @@ def test_what_cannot_be_rendered_again_is_refused(own, folder):
     loaded = mi.load_dict({"type": "scene", **scene_dict(folder)})
     first = mitransient_lidar.render(loaded, passes=2)
     assert not [name for name in first.attrs if name in ("scene_xml", "scene_dict")]
-    with pytest.raises(UserError, match=r"does not hold its scene .* rendered from loaded objects"):
-        mitransient_lidar.render(first)
+    must_refuse(r"does not hold its scene .* rendered from loaded objects", mitransient_lidar.render, first)
     assert json.loads(first.attrs["plugin_parameters"])["sea"]["interior"]["profile_tolerance"] == 0.1
-    with pytest.raises(UserError, match="not a result that can be rendered again"):
-        mitransient_lidar.render(first.drop_attrs())
+    must_refuse("not a result that can be rendered again", lambda: mitransient_lidar.render(first.drop_attrs()))
     for params, message in ((5, "params = 5 must be a dict"), ({"a": 1}, "need an XML scene")):
-        with pytest.raises(UserError, match=message):
-            mitransient_lidar.render(own, params=params)
+        must_refuse(message, mitransient_lidar.render, own, params=params)
 
 
 @pytest.mark.slow
@@ -268,8 +261,7 @@ def test_series_of_shots_give_the_same_bits(tmp_path):
     deeper = render_again(first, params={"target_depth": 6})
     assert not np.array_equal(deeper["waveform"], first["waveform"])
     np.testing.assert_array_equal(deeper["aim_x"], first["aim_x"])
-    with pytest.raises(UserError, match="rendered again as a whole"):
-        mitransient_lidar.render(first.isel(shot=[1]))
+    must_refuse("rendered again as a whole", mitransient_lidar.render, first.isel(shot=[1]))
     assert_refused(run("render", tmp_path / "a.nc"), "result of the command shots: use shots")
     assert_refused(run("shots", tmp_path / "a.nc", "--seed", 2, "-o", tmp_path / "b.nc"), "leave out seed")
     done = run("shots", tmp_path / "a.nc", "-o", tmp_path / "b.nc", "-q")

@@ -16,6 +16,7 @@ import significance
 import zarr
 from command_line import assert_refused, run
 from quick_campaign import QUICK, files_of, planned_copy, write_toml
+from rows import must_refuse
 
 from mitransient_lidar.campaigns import shard as shards
 from mitransient_lidar.campaigns import workers
@@ -23,11 +24,10 @@ from mitransient_lidar.campaigns.runs import FILES, check_versions
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.campaigns.sweep import campaign as run_campaign
 from mitransient_lidar.campaigns.sweep import resume
-from mitransient_lidar.core.errors import UserError
 
 
 @pytest.mark.slow
-def test_same_bits_whatever_shards_workers_order_and_interruptions(campaign, quick, tmp_path, request):
+def test_same_bits_whatever_shards_workers_order_and_interruptions(campaign, quick, tmp_path, request, default_ctrl_c):
     """Ctrl-C comes when three runs are done; processes write what they have, and this process renders the others."""
     path, pressed = tmp_path / "other.zarr", []
 
@@ -36,10 +36,8 @@ def test_same_bits_whatever_shards_workers_order_and_interruptions(campaign, qui
             pressed.append(state.done)
             os.kill(os.getpid(), signal.SIGINT)
 
-    former = signal.signal(signal.SIGINT, signal.default_int_handler)
     with pytest.raises(KeyboardInterrupt, match=r"interrupted after \d+ of 12 runs, which are kept; the same command"):
         run_campaign(campaign, path, workers=2, shard_size=5, progress=press)
-    signal.signal(signal.SIGINT, former)
     assert np.count_nonzero(Store(path).status() == DONE) >= 3
     request.getfixturevalue("in_this_process")
     first, other = open_campaign(quick), resume(path, workers=1)
@@ -120,13 +118,11 @@ def test_a_store_of_other_versions_is_not_completed(quick, tmp_path, caplog):
     now = group.attrs["versions"]
     group.attrs["versions"] = {**now, "mitsuba": "3.9.0"}
     text = r"older\.zarr was begun by other versions, and here is mitsuba 3\.9\.1 instead of 3\.9\.0: install those"
-    with pytest.raises(UserError, match=text):
-        resume(path, workers=1)
+    must_refuse(text, resume, path, workers=1)
     # Stores of version 0.2 have less.
     del group.attrs["versions"]
     group.attrs["drjit_version"] = "1.4.0"
-    with pytest.raises(UserError, match=r"drjit 1\.5\.0 instead of 1\.4\.0"):
-        resume(path, workers=1)
+    must_refuse(r"drjit 1\.5\.0 instead of 1\.4\.0", resume, path, workers=1)
     assert (Store(path).status() == PLANNED).all()
     check_versions(path, {"versions": {**now, FILES: "0123456789ab"}})
     assert "files of this package have changed since" in caplog.text
@@ -186,7 +182,6 @@ def shard_code(monkeypatch, arrays, start="pass"):
 
 @pytest.mark.slow
 def test_an_error_of_the_program_is_told_and_its_run_stays_planned(quick, tmp_path, monkeypatch):
-    """It once was tried twice, and stored as a failure of the run without its traceback."""
     path = planned_copy(quick, tmp_path / "bug.zarr")
     shard_code(monkeypatch, "{}[3] if number == 8 else arrays(self, number, values)")
     assert shards.render_in_process(str(path), 1) == (5, 0, "run 8: KeyError: 3")
@@ -199,7 +194,6 @@ def test_an_error_of_the_program_is_told_and_its_run_stays_planned(quick, tmp_pa
 @pytest.mark.long
 @pytest.mark.parametrize("deaths", [2, 3])
 def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch, deaths):
-    """Twice; it once ended the campaign."""
     path = planned_copy(quick, tmp_path / "early.zarr")
     (tmp_path / "deaths").mkdir()
     place = str(tmp_path / "deaths")
@@ -212,11 +206,9 @@ def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch
 
 @pytest.mark.slow
 def test_shards_that_cannot_be_rendered_are_left(quick, tmp_path, monkeypatch):
-    """The command says which ones to look at."""
     path = planned_copy(quick, tmp_path / "left.zarr")
     monkeypatch.setattr(workers, "render_in_process", lambda path, shard, *_: shards.Outcome(0, 0, "shard 0: lost"))
-    with pytest.raises(UserError, match=r"2 of 2 shards are not complete, .* shard 0: lost; .*left\.zarr\.log"):
-        resume(path, workers=1)
+    must_refuse(r"2 of 2 shards are not complete, .* shard 0: lost; .*left\.zarr\.log", resume, path, workers=1)
 
 
 @pytest.mark.long
@@ -259,7 +251,6 @@ except KeyboardInterrupt as error:
 
 @pytest.mark.long
 def test_nothing_listens_on_a_port(quick, tmp_path):
-    """Any user of the machine could once run code through the scheduler of a campaign."""
     psutil = pytest.importorskip("psutil")
     path, seen = planned_copy(quick, tmp_path / "closed.zarr"), []
 
@@ -277,7 +268,6 @@ def test_nothing_listens_on_a_port(quick, tmp_path):
 
 @pytest.mark.long
 def test_a_script_without_a_main_guard_that_is_interrupted_keeps_runs_of_its_shard(campaign, tmp_path):
-    """It once ended in 193 lines of tracebacks; and what a process had rendered in the last minute was lost."""
     path, script = tmp_path / "out.zarr", tmp_path / "script.py"
     script.write_text(SCRIPT)
     many = {**campaign, "design": {**campaign["design"], "count": 500}}

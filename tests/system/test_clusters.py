@@ -17,6 +17,7 @@ import psutil
 import pytest
 from command_line import assert_refused, run
 from quick_campaign import files_of, planned_copy
+from rows import each_case, must_refuse
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.campaigns import shard as shards
@@ -117,8 +118,7 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
         with pytest.raises(OSError, match="Timed out trying to connect"):
             resume(path, scheduler=client)
         monkeypatch.setattr(client, "status", "connecting")
-        with pytest.raises(UserError, match="the scheduler was lost: what is written is kept"):
-            resume(path, scheduler=client)
+        must_refuse("the scheduler was lost: what is written is kept", resume, path, scheduler=client)
         monkeypatch.undo()
         # One that is stopped never answers.
         monkeypatch.setattr(workers, "_ANSWER_S", 1)
@@ -127,8 +127,7 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
         process.send_signal(signal.SIGSTOP)
         goes_on = threading.Timer(30, process.send_signal, (signal.SIGCONT,))
         goes_on.start()
-        with pytest.raises(UserError, match="the scheduler was lost: what is written is kept"):
-            resume(path, scheduler=client)
+        must_refuse("the scheduler was lost: what is written is kept", resume, path, scheduler=client)
         assert not goes_on.finished.is_set()
         goes_on.cancel()
         process.send_signal(signal.SIGCONT)
@@ -137,7 +136,6 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
 
 @pytest.mark.long
 def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
-    """The campaign once waited for ever."""
     path = planned_copy(quick, tmp_path / "unreachable.zarr")
     nowhere = "tcp://127.0.0.1:9"
     command = worker_command(scheduler[1], tmp_path)
@@ -145,14 +143,12 @@ def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
         [*command, "--listen-address", "tcp://127.0.0.1:0", "--contact-address", nowhere], **SILENT
     ) as worker:
         address = json.loads(scheduler[1].read_text())["address"]
-        with pytest.raises(UserError, match=r"cannot reach its worker at tcp://127\.0\.0\.1:9"):
-            resume(path, scheduler=address)
+        must_refuse(r"cannot reach its worker at tcp://127\.0\.0\.1:9", resume, path, scheduler=address)
         worker.kill()
 
 
 @pytest.mark.long
 def test_a_process_that_hangs(quick, tmp_path, monkeypatch):
-    """The campaign once waited for ever, and later stored a run in which processes hung as failed."""
     path = planned_copy(quick, tmp_path / "hung.zarr")
     monkeypatch.setattr(shards, "_LOOK_S", 0.2)
     processes, alarms = shards.Processes(), []
@@ -174,17 +170,13 @@ def test_a_process_that_hangs(quick, tmp_path, monkeypatch):
     assert files_of(path) == files_of(quick)
 
 
-@pytest.mark.parametrize(
-    ("state", "error", "hangs"),
-    [
-        (psutil.STATUS_STOPPED, None, True),
-        (psutil.STATUS_DISK_SLEEP, None, False),
-        (None, psutil.NoSuchProcess(1), False),
-        (None, psutil.AccessDenied(1), False),
-    ],
+@each_case(
+    (psutil.STATUS_STOPPED, None, True),
+    (psutil.STATUS_DISK_SLEEP, None, False),
+    (None, psutil.NoSuchProcess(1), False),
+    (None, psutil.AccessDenied(1), False),
 )
 def test_a_process_hangs_that_neither_computes_nor_waits_for_a_disk(state, error, hangs, monkeypatch, caplog):
-    """One that waited for a server's disk was killed, and an error of the watch was silent."""
     looks, enough = [], threading.Event()
 
     def cpu_times():
@@ -224,13 +216,11 @@ OTHERS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["0.1.9"])
 def test_workers_of_other_versions_are_refused(quick, tmp_path, scheduler, kind):
-    """Half of a store once had the numbers of another version."""
     path = planned_copy(quick, tmp_path / "other.zarr")
     with subprocess.Popen(worker_command(scheduler[1], tmp_path, OTHERS[kind][0]), **SILENT) as worker:
         text = rf"the worker at tcp://127\.0\.0\.1:\d+ has {re.escape(OTHERS[kind][1])}: all that"
         try:
-            with pytest.raises(UserError, match=text):
-                resume(path, scheduler=json.loads(scheduler[1].read_text())["address"])
+            must_refuse(text, lambda: resume(path, scheduler=json.loads(scheduler[1].read_text())["address"]))
         finally:
             worker.kill()
     assert (Store(path).status() == PLANNED).all()
@@ -248,8 +238,6 @@ def test_the_process_of_a_shard_compares_versions_too(quick, tmp_path):
 
 @pytest.mark.slow
 def test_other_servers_than_schedulers(quick):
-    """An HTTP server once gave a traceback, and 40 s."""
-
     def serve():
         with contextlib.suppress(OSError):  # of the server's end
             while True:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from command_line import assert_refused, run
-from rows import each_row
+from rows import each_case, each_row
 from significance import variance_limits
 
 import mitransient_lidar
@@ -30,7 +30,6 @@ def record(name):
 
 
 def few(scene, integrator=FEW, **options):
-    """Render a few paths over a flat sea."""
     params = {"spectrum": "flat", **options.pop("params", {})}
     return mitransient_lidar.render(scene, params=params, integrator=integrator, passes=2, **options)
 
@@ -43,12 +42,13 @@ OWN = {"published_airborne": "table1", "published_mast": "fig04_mast"}
 KINDS = ("published_mast", "icesat2_atlas", "riegl_vq840g", "teledyne_czmil", "riegl_vq880g2_infrared")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow if name in KINDS else pytest.mark.long)
-        for name in catalogue.instrument_names()
-    ],
+@each_case(
+    *zip(
+        [
+            pytest.param(name, marks=pytest.mark.slow if name in KINDS else pytest.mark.long)
+            for name in catalogue.instrument_names()
+        ]
+    )
 )
 def test_every_instrument_renders(name):
     """Surface and bottom return light at their times, in every channel; a scene's own lidar gives the same bits."""
@@ -113,33 +113,30 @@ def test_the_infrared_channel_gives_the_surface_above_shallow_bottoms():
 
 
 @each_row(
-    ("arguments", "sentence"),
-    [
-        (["render", "table1", "--infrared"], "--instrument = None has no infrared channel; instruments with one are"),
-        (
-            ["render", "table1", "--instrument", "riegl_vq840g", "--infrared"],
-            "--instrument = 'riegl_vq840g' has no infrared channel; instruments with one are",
-        ),
-        (
-            ["render", "table1", "--instrument", "riegl_vq880g2", "--infrared", "-D", "infrared.wavelength_nm=1550"],
-            "wavelength_nm = 1550 must lie between 300 and 1100",
-        ),
-        (
-            ["render", "table1", "--instrument", "riegl_vq880g2", "--infrared", "-D", "infrared.pulse_fwhm_ns="],
-            "pulse_fwhm_ns = '' is empty",
-        ),
-        (["scenes", "instruments", "czmil"], "instrument = 'czmil' is not known; did you mean teledyne_czmil"),
-        (["scenes", "instruments", "--xml"], "--xml needs the name of an instrument"),
-        (["render", "table1", "--instrument", "eye"], "instrument = 'eye' is not known; instruments are icesat2_atlas"),
-        (
-            ["render", "table1", "--instrument", "teledyne_czmil", "-D", "layout=1x1"],
-            "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil",
-        ),
-        (
-            ["render", "table1", "--instrument", "riegl_vq840g", "-D", "aperture=1"],
-            "parameter 'aperture' is not one of scene table1 with instrument riegl_vq840g: did you mean aperture_area",
-        ),
-    ],
+    (["render", "table1", "--infrared"], "--instrument = None has no infrared channel; instruments with one are"),
+    (
+        ["render", "table1", "--instrument", "riegl_vq840g", "--infrared"],
+        "--instrument = 'riegl_vq840g' has no infrared channel; instruments with one are",
+    ),
+    (
+        ["render", "table1", "--instrument", "riegl_vq880g2", "--infrared", "-D", "infrared.wavelength_nm=1550"],
+        "wavelength_nm = 1550 must lie between 300 and 1100",
+    ),
+    (
+        ["render", "table1", "--instrument", "riegl_vq880g2", "--infrared", "-D", "infrared.pulse_fwhm_ns="],
+        "pulse_fwhm_ns = '' is empty",
+    ),
+    (["scenes", "instruments", "czmil"], "instrument = 'czmil' is not known; did you mean teledyne_czmil"),
+    (["scenes", "instruments", "--xml"], "--xml needs the name of an instrument"),
+    (["render", "table1", "--instrument", "eye"], "instrument = 'eye' is not known; instruments are icesat2_atlas"),
+    (
+        ["render", "table1", "--instrument", "teledyne_czmil", "-D", "layout=1x1"],
+        "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil",
+    ),
+    (
+        ["render", "table1", "--instrument", "riegl_vq840g", "-D", "aperture=1"],
+        "parameter 'aperture' is not one of scene table1 with instrument riegl_vq840g: did you mean aperture_area",
+    ),
 )
 def test_wrong_input_is_refused(arguments, sentence, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

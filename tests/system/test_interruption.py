@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from rows import each_case
 
 import mitransient_lidar
 
@@ -50,18 +51,6 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_on_the_command_line_keeps_the_passes(tmp_path, number, code):
-    process, stdout, stderr = render(INTERRUPTED, tmp_path, passes=100_000, before=[int(number)])
-    assert process.returncode == code, stderr
-    assert "interrupted after 3 passes; their result is kept" in stderr
-    assert names(tmp_path) == FILES
-    assert stdout.splitlines() == [str(tmp_path / name) for name in FILES]
-    attributes = mitransient_lidar.open(tmp_path / "table1.nc").attrs
-    assert (attributes["interrupted"], attributes["passes"]) == (1, 3)
-
-
 @pytest.mark.slow
 def test_a_closed_terminal_keeps_the_passes(tmp_path):
     """The terminal is closed, which sends SIGHUP, and every later output to it fails."""
@@ -98,16 +87,12 @@ app.main()
 """
 
 
-@pytest.mark.parametrize(
-    ("number", "code"),
-    [
-        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
-        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.long),
-        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.long),
-    ],
+@each_case(
+    pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
+    pytest.param(signal.SIGTERM, 143, marks=pytest.mark.long),
+    pytest.param(signal.SIGHUP, 129, marks=pytest.mark.long),
 )
 def test_a_signal_after_the_last_file_ends_as_any_other(number, code):
-    """Ctrl-C once gave a traceback and exit code 0."""
     process = start(LATE, int(number), "scenes", "list", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     stdout, stderr = process.communicate(timeout=240)
     assert (process.returncode, stderr) == (code, "")
@@ -116,7 +101,6 @@ def test_a_signal_after_the_last_file_ends_as_any_other(number, code):
 
 @pytest.mark.slow
 def test_a_render_with_closed_streams_writes_its_files_and_nothing_into_them(tmp_path):
-    """It once wrote nothing, with exit code 2; files took the number of stderr, which libraries write to."""
     coarse = ["-D", "surface_size=60", "-D", "surface_cell_size=0.5"]
     command = ["sh", "-c", '"$@" <&- >&- 2>&-', "sh", sys.executable, "-m", "mitransient_lidar", *RENDER, *coarse]
     done = subprocess.run([*command, "--passes", "2", "-o", str(tmp_path)], capture_output=True, text=True, check=True)

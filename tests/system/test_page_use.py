@@ -41,7 +41,6 @@ def scene():
 
 @pytest.fixture
 def watched(browser):
-    """Observe the pages that are opened."""
     script = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WATCH})
     yield browser
     browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)

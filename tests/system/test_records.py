@@ -6,10 +6,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from command_line import assert_refused, run
+from rows import each_case, must_refuse
 from significance import largest_z, mean_and_error
 
 import mitransient_lidar
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.transport.probe import Probe
@@ -62,13 +62,10 @@ def test_echoes_of_rays_through_the_waves_are_within(params):
     assert lidar.axis.end_ns - lidar.axis.start_ns < 2 * (last - first) + 200
 
 
-@pytest.mark.parametrize(
-    "offset",
-    [
-        pytest.param((-50, 0, -100), marks=pytest.mark.slow),
-        pytest.param((0, 50, 0), marks=pytest.mark.long),
-        pytest.param((50, 0, 0), marks=pytest.mark.long),
-    ],
+@each_case(
+    pytest.param((-50, 0, -100), marks=pytest.mark.slow),
+    pytest.param((0, 50, 0), marks=pytest.mark.long),
+    pytest.param((50, 0, 0), marks=pytest.mark.long),
 )
 def test_less_than_1e_4_of_the_energy_is_outside_of_a_receiver_beside_the_laser(offset):
     outside(lambda film: (beside(offset, film), None))
@@ -145,18 +142,14 @@ def test_a_scene_without_water():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("params", "sentence"),
-    [
-        ({"bin_width_ns": 1e-5}, "bin_width_ns = 1e-05 divides the time axis from 139"),
-        ({"bin_count": "some"}, "bin_count = 'some' must be a number"),
-        ({"bin_count": 5}, "bin_count = 5 bins of 1 ns end the record at 1390 ns: it must end after the surface echo"),
-    ],
+@each_case(
+    ({"bin_width_ns": 1e-5}, "bin_width_ns = 1e-05 divides the time axis from 139"),
+    ({"bin_count": "some"}, "bin_count = 'some' must be a number"),
+    ({"bin_count": 5}, "bin_count = 5 bins of 1 ns end the record at 1390 ns: it must end after the surface echo"),
 )
 def test_invalid_records_are_refused(params, sentence, tmp_path):
     params = {"spectrum": "flat", **params}
-    with pytest.raises(UserError, match=sentence):
-        mitransient_lidar.render("table1", params=params, passes=2)
+    must_refuse(sentence, mitransient_lidar.render, "table1", params=params, passes=2)
     words = [word for name, value in params.items() for word in ("-D", f"{name}={value}")]
     assert_refused(run("render", "table1", "-q", "-o", tmp_path, *words), sentence)
     assert list(tmp_path.iterdir()) == []

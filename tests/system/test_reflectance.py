@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
+from rows import each_case
 from significance import largest_z
 
 import mitransient_lidar
@@ -43,25 +44,22 @@ def shot(lidar_scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("tx", "rx"),
-    [
-        pytest.param({}, {}, id="quarters", marks=pytest.mark.long),
-        # Hexagons with gaps are obscured, too.
-        pytest.param({}, {"obscuration": 0.3}, id="obscured", marks=pytest.mark.long),
-        pytest.param({}, {"fill_factor": 0.5}, id="gaps", marks=pytest.mark.long),
-        pytest.param({}, {"layout": "hex7"}, id="hexagons", marks=pytest.mark.long),
-        pytest.param({}, {"layout": "hex19", "fill_factor": 0.5, "obscuration": 0.3}, id="hexagons with gaps"),
-        pytest.param({}, OFF_AXIS, id="off axis", marks=pytest.mark.long),
-        pytest.param(
-            {"divergence_mrad": 16.0, "divergence_across_mrad": 4.0, "ellipse_deg": 30.0},
-            {"field_of_view_mrad": 20.0},
-            id="ellipse",
-            marks=pytest.mark.long,
-        ),
-        pytest.param({"beam_profile": "top_hat"}, {}, id="top hat", marks=pytest.mark.long),
-        pytest.param({"beam_profile": "top_hat"}, {"field_of_view_mrad": 8.0}, id="narrow", marks=pytest.mark.long),
-    ],
+@each_case(
+    pytest.param({}, {}, id="quarters", marks=pytest.mark.long),
+    # Hexagons with gaps are obscured, too.
+    pytest.param({}, {"obscuration": 0.3}, id="obscured", marks=pytest.mark.long),
+    pytest.param({}, {"fill_factor": 0.5}, id="gaps", marks=pytest.mark.long),
+    pytest.param({}, {"layout": "hex7"}, id="hexagons", marks=pytest.mark.long),
+    pytest.param({}, {"layout": "hex19", "fill_factor": 0.5, "obscuration": 0.3}, id="hexagons with gaps"),
+    pytest.param({}, OFF_AXIS, id="off axis", marks=pytest.mark.long),
+    pytest.param(
+        {"divergence_mrad": 16.0, "divergence_across_mrad": 4.0, "ellipse_deg": 30.0},
+        {"field_of_view_mrad": 20.0},
+        id="ellipse",
+        marks=pytest.mark.long,
+    ),
+    pytest.param({"beam_profile": "top_hat"}, {}, id="top hat", marks=pytest.mark.long),
+    pytest.param({"beam_profile": "top_hat"}, {"field_of_view_mrad": 8.0}, id="narrow", marks=pytest.mark.long),
 )
 def test_reflectance_within_its_error(tx, rx, shot):
     """Within one stated error, a sixth to a fifth of the reflectance.
@@ -92,16 +90,13 @@ def test_forward_scattering_leaves_no_bias(jerlov, shot):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("field_of_view", "water"),
-    [
-        (30.0, {"attenuation": "0.9, 0.5", "scattering": "0.45, 0.25", "backscattering": "0.018, 0.010"}),
-        pytest.param(
-            10.0,
-            {"attenuation": "0.6, 0.3", "scattering": "0.4, 0.15", "backscattering": "0.012, 0.006"},
-            marks=pytest.mark.long,
-        ),
-    ],
+@each_case(
+    (30.0, {"attenuation": "0.9, 0.5", "scattering": "0.45, 0.25", "backscattering": "0.018, 0.010"}),
+    pytest.param(
+        10.0,
+        {"attenuation": "0.6, 0.3", "scattering": "0.4, 0.15", "backscattering": "0.012, 0.006"},
+        marks=pytest.mark.long,
+    ),
 )
 def test_two_layers_leave_no_class_that_looks_sure(field_of_view, water, shot):
     """The exponential of the upper layer, continued to the bottom, would give 0.3 to 0.8 for 0.15."""

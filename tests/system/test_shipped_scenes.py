@@ -5,6 +5,7 @@ import logging
 
 import numpy as np
 import pytest
+from rows import each_case
 from same_bits import assert_same_bits
 
 import mitransient_lidar
@@ -30,12 +31,13 @@ ALIKE = {
 PASSIVE = {"passive_sea"}
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.long if name in ALIKE else pytest.mark.slow)
-        for name in sorted(set(catalogue.scene_names()) - PASSIVE)
-    ],
+@each_case(
+    *zip(
+        [
+            pytest.param(name, marks=pytest.mark.long if name in ALIKE else pytest.mark.slow)
+            for name in sorted(set(catalogue.scene_names()) - PASSIVE)
+        ]
+    )
 )
 def test_scene(name, tmp_path, caplog):
     """One small render, its files, and renders of these.

@@ -1,18 +1,22 @@
-"""Shots that are rendered together, against the same shots on their own."""
+"""Shots of a batch, and places to shoot at."""
 
+import math
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from significance import assert_same
+from rows import each_case
+from significance import assert_same, largest_z
 
+from mitransient_lidar.loading import scenes
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotPoses
-from mitransient_lidar.rendering.shots.series import render_shots
+from mitransient_lidar.studies import shots
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes
 
@@ -162,10 +166,7 @@ def test_heights_of_shots_are_those_at_their_places(depth, slope):
         np.testing.assert_allclose(found.bed_at(mi.Float(x), mi.Float(y)), bed.p.z, atol=0.01)
 
 
-@pytest.mark.parametrize(
-    "integrator",
-    [pytest.param("lidar_merging", marks=pytest.mark.slow), pytest.param("lidar_volpath", marks=pytest.mark.long)],
-)
+@each_case(pytest.param("lidar_merging", marks=pytest.mark.slow), pytest.param("lidar_volpath", marks=pytest.mark.long))
 def test_a_level_scene_is_the_same_everywhere(integrator):
     """On common random numbers: rays left surfaces 9e-5 of their distance from the world's origin too far away."""
     energies = []
@@ -181,16 +182,53 @@ def test_a_level_scene_is_the_same_everywhere(integrator):
     np.testing.assert_allclose(total, total[0], rtol=1e-3)
 
 
-@pytest.mark.long
-def test_target_goes_with_the_shots():
-    """On a level sea all shots are the same, those with a target that goes with them too, by origin."""
-    params = {"spectrum": "flat", "target_depth": 5, "target_x": 0.4, "layout": "2x2"}
-    options = {"passes": 4, "pass_share": 0.05, "components": True}
-    series = render_shots("fig13_2x2", params, positions=np.repeat(PLACES, 8, axis=0), move_target=True, **options)
-    assert list(series["origin"].values) == ["surface", "water", "target", "bottom"]
-    assert series["waveform_by_origin"].dims == ("shot", "origin", "pixel", "time")
-    for name in ("impulse_response", "waveform"):
-        np.testing.assert_array_equal(series[f"{name}_by_origin"].sum("origin"), series[name])
-    energy = series["impulse_response_by_origin"].sum(["pixel", "time"]).values.reshape(len(PLACES), 8, 4)
-    for place in energy[1:]:
-        assert_same(place, energy[0], error=0.03, known=0.15)
+WAVES = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15}
+
+
+@pytest.fixture(scope="module")
+def sea():
+    return shots.SeaMap.of_scene(scenes.open_scene("fig09_2x2", WAVES).scene)
+
+
+@pytest.mark.slow
+def test_slopes_are_means_over_the_footprint(sea):
+    """Against random points of a Gaussian of the footprint's mean radius, 1.1 m, on the heights themselves."""
+    rng = np.random.default_rng(4)
+    spacing = sea.x[1] - sea.x[0]
+    radius = 1.064 / math.sqrt(math.cos(math.radians(20)))
+    for x, y in ((sea.x[200], sea.y[10]), (sea.x[470], sea.y[333])):
+        i, j = (np.rint((place + rng.normal(0, radius, 40_000) - lines[0]) / spacing).astype(int) % len(lines)
+                for place, lines in ((x, sea.x), (y, sea.y)))  # fmt: skip
+        right = (sea.heights[j, (i + 1) % len(sea.x)] - sea.heights[j, i - 1]) / (2 * spacing)
+        up = (sea.heights[(j + 1) % len(sea.y), i] - sea.heights[j - 1, i]) / (2 * spacing)
+        for drawn, mean in zip((right, up), sea.slope_at(x, y), strict=True):
+            assert abs(drawn.mean() - mean) < largest_z(drawn.size, 4) * drawn.std() / 200 + 0.002
+
+
+@pytest.mark.slow
+def test_each_kind_of_shot_has_the_slope_that_it_is_named_for(sea):
+    found = shots.find_shots("fig09_2x2", WAVES, slope_sigmas=1.5, count=3, waveforms=False).shots
+    assert [shot.kind for shot in found] == [kind for kind in shots.SLOPE_KINDS for _ in range(3)]
+    spread = sea.along.std(), sea.across.std()
+    for shot in found:
+        wanted = shots.SLOPE_KINDS[shot.kind]
+        assert shot.along == pytest.approx(1.5 * wanted[0] * spread[0], abs=0.1 * spread[0])
+        assert shot.across == pytest.approx(1.5 * wanted[1] * spread[1], abs=0.1 * spread[1])
+        assert sea.slope_at(shot.x, shot.y) == pytest.approx((shot.along, shot.across))
+    for first, second in pairwise(found):
+        if first.kind == second.kind:
+            assert math.hypot(first.x - second.x, first.y - second.y) > 4
+
+
+@pytest.mark.slow
+def test_depth_bias_is_that_of_a_ray_through_the_slope():
+    """A ray traced with vectors through a tilted plane that meets it at the mean level, down to the bottom."""
+    for slope in (-0.12, 0.0, 0.05):
+        normal = np.array([-slope, 1.0]) / math.hypot(slope, 1)
+        ray = np.array([math.sin(0.35), -math.cos(0.35)])
+        cosine = -ray @ normal
+        down = ray / 1.34 + (cosine / 1.34 - math.sqrt(1 - (1 - cosine**2) / 1.34**2)) * normal
+        level = math.cos(math.asin(math.sin(0.35) / 1.34))
+        expected = 5.0 / -down[1] * level - 5.0
+        assert shots.depth_bias(np.array([slope]), 5.0, 0.35, 1.34)[0] == pytest.approx(expected, abs=1e-12)
+    assert shots.depth_bias(np.array([-0.1]), 5.0, 0.35, 1.34)[0] < -0.03

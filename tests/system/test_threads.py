@@ -11,10 +11,10 @@ import warnings
 import numpy as np
 import OpenEXR
 import pytest
+from rows import each_case, must_refuse
 from same_bits import assert_same_bits
 
 import mitransient_lidar
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.formats.array_files import read_exr
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.results import save
@@ -73,10 +73,8 @@ def alone():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "threads", [2, pytest.param(4, marks=pytest.mark.long), pytest.param(8, marks=pytest.mark.long)]
-)
-def test_renders_have_the_bits_of_those_alone(alone, threads):
+@each_case(2, pytest.param(4, marks=pytest.mark.long), pytest.param(8, marks=pytest.mark.long))
+def test_renders_have_the_bits_of_those_alone(threads, alone):
     """Without a lock, 2 of 6 in two threads had others: long kernels, which begin at once, overlap."""
     starts, interval = threading.Barrier(threads), sys.getswitchinterval()
 
@@ -138,8 +136,7 @@ def test_files_and_records_have_the_bits_of_those_alone(result, tmp_path):
             save(result.assign_attrs(case=case % 2), path)
             found.append(mitransient_lidar.open(path))
             damaged.write_bytes(path.read_bytes()[:-100])
-            with pytest.raises(UserError, match="damaged"):
-                mitransient_lidar.open(damaged)
+            must_refuse("damaged", mitransient_lidar.open, damaged)
         recorded = mitransient_lidar.record(result, "published_airborne", seed=case % 2)
         return [*found, recorded, mitransient_lidar.echoes(recorded)]
 

@@ -1,8 +1,9 @@
-"""Functions at the top of the package: signatures, documentation, completion, and what they refuse."""
+"""Functions at the top of the package: signatures, documentation, completion, what they refuse, and dependencies."""
 
 import inspect
 import pydoc
 import re
+import sys
 from pathlib import Path
 
 import jedi
@@ -10,7 +11,10 @@ import numpy as np
 import pytest
 import synthetic_shots
 import xarray as xr
-from rows import each_row
+from dependency_versions import ROOT, requirements
+from packaging.utils import canonicalize_name
+from planted_faults import FAULTS
+from rows import each_case, each_row
 
 import mitransient_lidar
 from mitransient_lidar.analysis.receiver import detect_waveforms
@@ -44,7 +48,7 @@ def gates():
     return xr.Dataset({"gate_energy": energy, "gate_energy_stderr": energy}, coords)
 
 
-@each_row("name", PUBLIC)
+@each_row(*zip(PUBLIC))
 def test_every_name_is_documented(name):
     assert name in dir(mitransient_lidar)
     if name in FUNCTIONS:
@@ -58,7 +62,7 @@ def test_every_name_is_documented(name):
 
 
 # Images by daylight have no laser, which an instrument replaces.
-@each_row("name", [one for one in FUNCTIONS if "scene" in parameters(one) and one != "render_passive"])
+@each_row(*zip([one for one in FUNCTIONS if "scene" in parameters(one) and one != "render_passive"]))
 def test_parameters_and_an_instrument_go_with_every_scene(name):
     assert {"params", "instrument"} < {*parameters(name)}
 
@@ -70,12 +74,9 @@ def test_a_star_import_leaves_open_alone():
     assert {"render", "GateTrain", "SURVEY_ORDERS"} < set(names)
 
 
-@each_row(
-    ("name", "given"),
-    [(name, one) for name in FUNCTIONS for one in parameters(name) if one in GIVEN and name != "figures"],
-)
-@each_row("value", ["missing.nc", Path("missing.nc"), None, 3, "gates", "other"])
-def test_what_is_given_by_mistake_is_refused_in_a_sentence(name, given, value, tmp_path, monkeypatch):
+@each_row(*[(name, one) for name in FUNCTIONS for one in parameters(name) if one in GIVEN and name != "figures"])
+@each_row("missing.nc", Path("missing.nc"), None, 3, "gates", "other")
+def test_what_is_given_by_mistake_is_refused_in_a_sentence(value, name, given, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     is_default = value is None and parameters(name)[given].default is None
     if is_default or {(name, given), (name, value if isinstance(value, str) else "")} & TAKEN:
@@ -103,9 +104,7 @@ def test_what_is_given_by_mistake_is_refused_in_a_sentence(name, given, value, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [name for name in FUNCTIONS if DATASETS & {*parameters(name)} and name not in OF_FILES]
-)
+@each_case(*zip([name for name in FUNCTIONS if DATASETS & {*parameters(name)} and name not in OF_FILES]))
 def test_a_path_gives_what_its_dataset_gives(name, tmp_path):
     shots = synthetic_shots.result()
     if name == "correct_depths":
@@ -184,3 +183,47 @@ def test_former_names_are_refused_with_the_new_one():
     for old, new in mitransient_lidar._FORMER.items():
         with pytest.raises(AttributeError, match=re.escape(f"mitransient_lidar.{old} is now {new}")):
             getattr(mitransient_lidar, old)
+
+
+#: Packages by their modules, where the names differ.
+PACKAGES = {"PIL": "pillow"}
+
+#: Dependencies that no file imports: a shared library, what builds the wheel in a test, and a plugin of pytest.
+NOT_IMPORTED = {"karellen-llvm-core", "setuptools", "pytest-xdist"}
+
+#: Packages that tests import where they are installed: of tests with a browser, and a second reader of LAS files.
+OPTIONAL = {"selenium", "lazpy"}
+
+
+#: A line that imports, which takes a tenth of the time of a syntax tree to find.
+IMPORT = re.compile(r"^ *(?:import (?=[\w.]+(?: as \w+)?$)|from (?=[\w.]+ import ))(\w+)", re.MULTILINE)
+
+
+def declared(*extras):
+    """Return the names of the dependencies and of those of extras, as package indices normalise them."""
+    return {canonicalize_name(requirement.name) for requirement in requirements(*extras)}
+
+
+def imported(*folders):
+    """Return the names of the packages whose modules the Python files of folders import, at any depth of the code."""
+    files = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
+    own = {"mitransient_lidar", *(path.stem for path in (ROOT / "tests").iterdir())}
+    names = {name for file in files for name in IMPORT.findall(file.read_text("utf-8"))} - own - sys.stdlib_module_names
+    return {canonicalize_name(PACKAGES.get(name, name)) for name in names}
+
+
+def test_the_package_imports_what_it_declares_and_nothing_else():
+    """The scripts among the example files of `scenes` name what they need besides."""
+    assert imported("mitransient_lidar", "plugins") == declared("movie") - NOT_IMPORTED
+
+
+def test_the_tests_import_what_their_extra_declares_and_nothing_else():
+    found = imported("tests")
+    assert found <= declared("movie", "test") | OPTIONAL
+    assert declared("test") - declared() - found - declared("movie") == NOT_IMPORTED - declared()
+
+
+def test_planted_faults_are_where_their_code_is():
+    """Those of a code that has moved would plant nothing."""
+    for fault in FAULTS:
+        assert (ROOT / fault.file).read_text("utf-8").count(fault.old) == fault.count, fault.name

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from rows import each_row
+from rows import each_case, each_row, must_refuse
 
 from mitransient_lidar.campaigns import sweep
 from mitransient_lidar.campaigns.design import Campaign
@@ -82,7 +82,6 @@ def out_of_space(*_, **__):
 
 
 def filled(store, shard, value):
-    """Return what is written of a shard with equal values."""
     status, errors, arrays = store.read(shard)
     return status, errors, {name: np.full_like(array, value) for name, array in arrays.items()}
 
@@ -156,7 +155,6 @@ def test_status_is_written_last(store, path, monkeypatch):
 
 
 def flip(path):
-    """Flip a bit in the middle of a file."""
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 4
     path.write_bytes(data)
@@ -165,12 +163,10 @@ def flip(path):
 CHUNKS = ["waveform/c/1/0/0/0", "echo_flags/c/1/0/0", "error/c/1", "status/c/1", "surface_seed/c/1"]
 
 
-@pytest.mark.parametrize(
-    ("chunk", "damage"),
-    [*((chunk, flip) for chunk in CHUNKS), (CHUNKS[0], Path.unlink), (CHUNKS[1], lambda path: path.write_bytes(b""))],
+@each_case(
+    *((chunk, flip) for chunk in CHUNKS), (CHUNKS[0], Path.unlink), (CHUNKS[1], lambda path: path.write_bytes(b""))
 )
-def test_damaged_shards_are_planned_again(full, path, caplog, chunk, damage):
-    """Three flipped bits, or a missing chunk, once gave other numbers of runs that are done."""
+def test_damaged_shards_are_planned_again(chunk, damage, full, path, caplog):
     damage(path / chunk)
     store = Store(path)
     store.mend()
@@ -201,25 +197,23 @@ def test_damaged_values_are_not_read(full, path):
     with pytest.raises(UserError, match=r"campaign\.zarr is damaged"), reporting_damage(path):
         data["waveform"].load()
     (path / "waveform" / "zarr.json").write_text("{")
-    with pytest.raises(UserError, match=r"campaign\.zarr is damaged"):
-        Store(path)
+    must_refuse(r"campaign\.zarr is damaged", Store, path)
 
 
-@each_row("name", ["time", "time_input", "pixel", "run", "shot", "layout"])
-@each_row("damage", [flip, Path.unlink])
-def test_damaged_coordinates_are_refused(made, tmp_path, name, damage):
+@each_row("time", "time_input", "pixel", "run", "shot", "layout")
+@each_row(flip, Path.unlink)
+def test_damaged_coordinates_are_refused(damage, name, made, tmp_path):
     path = shutil.copytree(made / "full", tmp_path / "campaign.zarr")
     damage(path / name / "c" / "0")
     with pytest.raises(ValueError, match=r"campaign\.zarr is damaged|checksum"):
         open_campaign(path).load()
 
 
-@each_row("name", ["time", "time_input", "pixel", "run", "shot", "layout", "waveform"])
-def test_a_store_that_has_lost_an_array_is_refused(made, tmp_path, name):
+@each_row("time", "time_input", "pixel", "run", "shot", "layout", "waveform")
+def test_a_store_that_has_lost_an_array_is_refused(name, made, tmp_path):
     path = shutil.copytree(made / "full", tmp_path / "campaign.zarr")
     shutil.rmtree(path / name)
-    with pytest.raises(UserError, match=rf"campaign\.zarr is damaged: (it has lost {name}|{name} cannot be read)"):
-        open_campaign(path)
+    must_refuse(rf"campaign\.zarr is damaged: (it has lost {name}|{name} cannot be read)", open_campaign, path)
 
 
 @pytest.mark.parametrize(
@@ -244,8 +238,7 @@ def test_edited_attributes_are_refused(full, path, change, message, sealed):
     if sealed and not message:
         Store(path)
         return
-    with pytest.raises(UserError, match=message if sealed else "is no store|its attributes have changed"):
-        Store(path)
+    must_refuse(message if sealed else "is no store|its attributes have changed", Store, path)
 
 
 def test_a_store_that_another_process_has_just_made(full, path):
@@ -292,7 +285,6 @@ def test_size_of_shards(tmp_path):
 
 
 def test_shards_of_all_workers_are_within_the_memory(store, monkeypatch):
-    """One shard was: each worker has one."""
     monkeypatch.setattr(validation, "usable_memory", lambda: 2000.0)
     rendered = []
     monkeypatch.setattr(sweep, "on_this_machine", lambda few, *_: contextlib.nullcontext(few))
@@ -305,7 +297,6 @@ def test_shards_of_all_workers_are_within_the_memory(store, monkeypatch):
 
 @pytest.mark.parametrize("name", ["zarr.json", "waveform", "waveform/zarr.json", "status/c/0"])
 def test_links_in_a_store_are_not_followed(store, path, tmp_path, name):
-    """They would lead to any file of whoever opens the store, and `mend` would write to it."""
     status, errors, arrays = filled(store, 0, 1)
     status[:] = DONE
     store.write(0, status, errors, arrays)
@@ -314,13 +305,11 @@ def test_links_in_a_store_are_not_followed(store, path, tmp_path, name):
     (path / name).rename(victim)
     (path / name).symlink_to(victim)
     for read in (Store, open_campaign, describe_campaign):
-        with pytest.raises(UserError, match=f"{name} is a link, and no link in it is followed"):
-            read(path)
+        must_refuse(f"{name} is a link, and no link in it is followed", read, path)
     os.mkfifo(victim.with_name("pipe"))
     (path / name).unlink()
     victim.with_name("pipe").rename(path / name)
-    with pytest.raises(UserError, match=rf"{name}: it is a named pipe"):
-        Store(path)
+    must_refuse(rf"{name}: it is a named pipe", Store, path)
 
 
 def test_an_include_in_the_scene_of_a_store_is_refused(store, path):

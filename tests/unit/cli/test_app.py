@@ -5,8 +5,6 @@ import io
 import logging
 import os
 import signal
-import subprocess
-import sys
 import time as clock
 from types import SimpleNamespace
 
@@ -37,7 +35,6 @@ def scene(tmp_path, monkeypatch):
 
 @pytest.fixture
 def calls(monkeypatch):
-    """Replace the renderer; return what it was called with."""
     seen = []
     extra = {}
 
@@ -81,9 +78,8 @@ def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
     assert results.open(out / "fig09.nc").attrs["interrupted"] == 1
 
 
-@each_row("quiet", [True, False])
+@each_row(True, False)
 def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path, monkeypatch, caplog):
-    """They once were shown after its report, and earlier, those of the program that called it were silent, too."""
     logger = logging.getLogger("mitransient_lidar")
     before = logger.propagate, logger.level, [*logger.handlers]
     monkeypatch.setattr("mitransient_lidar.results.dataset_of", lambda *_: logger.warning("early") or xr.Dataset())
@@ -96,15 +92,11 @@ def test_messages_of_a_quiet_command_alone_are_silent_to_its_end(quiet, tmp_path
     assert (logger.propagate, logger.level, logger.handlers) == before
 
 
-@pytest.mark.parametrize(
-    ("command", "describe", "plot"),
-    [
-        ("detect", "describe_detection", "targets:plot_detection"),
-        ("scattering", "describe_scattering", "light:plot_scattering"),
-    ],
+@each_row(
+    ("detect", "describe_detection", "targets:plot_detection"),
+    ("scattering", "describe_scattering", "light:plot_scattering"),
 )
 def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, describe, plot, monkeypatch, tmp_path):
-    """Their drawings are of the passes until then; the exit code was once 0."""
     study = COMMANDS[command].function.partition(":")[0]
     stub(monkeypatch, command, lambda **_: xr.Dataset(attrs={"interrupted": 1, "passes": 3}))
     monkeypatch.setattr(f"mitransient_lidar.{study}.{describe}", lambda _: ["lines"])
@@ -127,8 +119,6 @@ def test_interruption_elsewhere_leaves_nothing_and_a_bug_is_not_taken_for_a_mist
 
 
 def test_a_disk_without_space_for_the_last_picture_leaves_the_former_files(scene, calls, tmp_path, monkeypatch):
-    """Its sentence once passed for one of pixels that do not see the sea, with exit code 0 and a stale picture."""
-
     def full(dataset, path):
         with replacing(path):
             raise OSError(errno.ENOSPC, "full")
@@ -140,8 +130,7 @@ def test_a_disk_without_space_for_the_last_picture_leaves_the_former_files(scene
     assert [(path.name, path.read_text()) for path in tmp_path.glob("fig09*")] == [("fig09_layout.png", "old")]
 
 
-def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tmp_path, monkeypatch):
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tmp_path, monkeypatch, default_ctrl_c):
     save = results.save
 
     def interrupted(dataset, path):
@@ -150,10 +139,7 @@ def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tm
         save(dataset, path)
 
     monkeypatch.setattr(results, "save", interrupted)
-    try:
-        result = run("render", scene, "-o", tmp_path / "out", "--quiet", "--no-plot")
-    finally:
-        signal.signal(signal.SIGINT, before)
+    result = run("render", scene, "-o", tmp_path / "out", "--quiet", "--no-plot")
     assert result.exit_code == 130
     assert results.open(tmp_path / "out" / "fig09.nc").attrs["passes"] == 4
     assert (tmp_path / "out" / "fig09.exr").exists()
@@ -169,31 +155,6 @@ def test_unwritable_output_is_noticed_before_rendering(scene, calls, tmp_path):
         assert_refused(run("render", scene, "-o", tmp_path / name), "its name must have no control characters")
         assert not (tmp_path / name).exists()
     assert not calls.seen
-
-
-@pytest.mark.slow
-def test_plot(scene, calls, tmp_path):
-    run("render", scene, "-o", tmp_path, "--no-plot", "--quiet")
-    result = run("view", "--plot", tmp_path / "fig09.exr")
-    assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'fig09.png'}\n")
-    both = (tmp_path / "fig09.png").read_bytes()
-    for option in ("--log", "--linear"):
-        result = run("view", "--plot", tmp_path / "fig09.nc", option, "-o", tmp_path / "b.png")
-        assert result.exit_code == 0, result.output
-        # One panel is less high than two; the height stands in bytes 20 to 24.
-        assert (tmp_path / "b.png").read_bytes()[20:24] < both[20:24]
-    assert_refused(run("view", "--plot", tmp_path / "fig09.nc", "-o", tmp_path / "a.txt"), "must end in .png")
-
-
-@pytest.mark.slow
-def test_command_line_imports_nothing_slow():
-    code = (
-        "import sys, mitransient_lidar; before = set(sys.modules); import mitransient_lidar.cli.app;"
-        "new = {name.partition('.')[0] for name in set(sys.modules) - before};"
-        "print(new & {'mitsuba', 'xarray', 'matplotlib', 'OpenEXR', 'scipy', 'numpy', 'rich'})"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\n"
 
 
 #: Sets colour and title of a terminal, rings, and turns the order of letters.

@@ -1,15 +1,12 @@
 """Invalid input: one sentence on stderr with parameter and value, exit code 2, no output and no file."""
 
-import os
 import re
-import subprocess
-import sys
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from command_line import assert_refused, run
-from rows import each_row
+from rows import each_row, refuses
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
@@ -91,7 +88,7 @@ def shows(sentence, value):
     return any(form in sentence for form in forms)
 
 
-@each_row(("scene", "name", "value", "part"), PARAMETERS)
+@each_row(*PARAMETERS)
 def test_parameters_of_scenes(scene, name, value, part):
     with pytest.raises(UserError, match=re.escape(part)) as caught:
         scenes.open_scene(scene, {name: value})
@@ -101,8 +98,8 @@ def test_parameters_of_scenes(scene, name, value, part):
     assert shows(sentence, value)
 
 
-@each_row(("scene", "name", "value", "part"), PARAMETERS[::12])
-def test_parameters_of_scenes_on_the_command_line(folder, scene, name, value, part):
+@each_row(*PARAMETERS[::12])
+def test_parameters_of_scenes_on_the_command_line(scene, name, value, part, folder):
     result = run("render", scene, "--passes", 2, "-D", f"{name}={value}")
     assert_refused(result, name, part)
     assert shows(result.stderr, value)
@@ -134,26 +131,23 @@ OPTIONS = [
 
 
 @each_row(
-    ("arguments", "part"),
-    [
-        *(((*command, option, value), part) for command, option, value, part in OPTIONS),
-        (["render"], "Missing argument 'SCENE'"),
-        (["render", "table1", "two"], "Got unexpected extra argument"),
-        (["rendr", "table1"], "No such command 'rendr'"),
-        (["--fast"], "No such option: --fast"),
-        (["scenes", "hide"], "No such command 'hide'"),
-        (["render", "tabel1"], "did you mean table1"),
-        (["render", "."], "is a folder"),
-        (["render", "/dev/zero"], "cannot read /dev/zero: it is a device, and only regular files are read"),
-        (["view", "/dev/zero"], "/dev/zero: it is a device"),
-        (["view", "missing.nc"], "missing.nc"),
-        (["echoes", "/dev/zero"], "/dev/zero"),
-        (["scenes", "water", "mud"], "kind = 'mud' must be one of jerlov"),
-        (["compare", "/dev/zero", "/dev/zero"], "/dev/zero: it is a device"),
-        (["gates", "/dev/zero", "--start-ns", 1, "--width-ns", 1, "--count", 1], "/dev/zero"),
-    ],
+    *(((*command, option, value), part) for command, option, value, part in OPTIONS),
+    (["render"], "Missing argument 'SCENE'"),
+    (["render", "table1", "two"], "Got unexpected extra argument"),
+    (["rendr", "table1"], "No such command 'rendr'"),
+    (["--fast"], "No such option: --fast"),
+    (["scenes", "hide"], "No such command 'hide'"),
+    (["render", "tabel1"], "did you mean table1"),
+    (["render", "."], "is a folder"),
+    (["render", "/dev/zero"], "cannot read /dev/zero: it is a device, and only regular files are read"),
+    (["view", "/dev/zero"], "/dev/zero: it is a device"),
+    (["view", "missing.nc"], "missing.nc"),
+    (["echoes", "/dev/zero"], "/dev/zero"),
+    (["scenes", "water", "mud"], "kind = 'mud' must be one of jerlov"),
+    (["compare", "/dev/zero", "/dev/zero"], "/dev/zero: it is a device"),
+    (["gates", "/dev/zero", "--start-ns", 1, "--width-ns", 1, "--count", 1], "/dev/zero"),
 )
-def test_commands_and_options(folder, arguments, part):
+def test_commands_and_options(arguments, part, folder):
     assert_refused(run(*arguments), part)
 
 
@@ -174,34 +168,28 @@ def replaced(old, new):
 
 
 @each_row(
-    ("change", "part"),
-    [
-        (without("sensor"), "sensor: the scene has none"),
-        (without("emitter"), "emitters: the scene has 0 of which 0 are lidar_transmitter"),
-        (without("film"), "film: sensor 'receiver' has none; add a time_gated_film"),
-        (without("medium"), "ocean_surface 'surface': needs a layered_water as its interior medium"),
-        (without("integrator"), "integrator: the scene has no lidar integrator"),
-        (replaced("<film", '<float name="apertur_area" value="1"/><film'), "did you mean aperture_area"),
-        (
-            replaced('id="transmitter"/>', 'id="transmitter"><float name="divergense" value="1"/></emitter>'),
-            "divergense",
-        ),
-        (replaced('<float name="bin_width_ns"', '<float name="bin_with"'), "time_gated_film: there is no parameter"),
-        (replaced('name="wind_speed" value="3"', 'name="wind_speed" value=""'), "wind_speed = '' is empty"),
-        (replaced('"$bottom_reflectance"', '"1.2"'), "reflectance = 1.2 must lie between 0 and 1"),
-        (replaced('type="sediment"', 'type="sedimnt"'), "did you mean sediment"),
-        (replaced('type="lidar_transmitter"', 'type="lidar_transmiter"'), "did you mean lidar_transmitter"),
-        (replaced('"-$bottom_depth"', '"-$bottom_dept"'), "z = '-$bottom_dept' refers to an unknown parameter"),
-        (replaced('name="wind_speed" value="3"', 'name="wind_speed" value="inf"'), "wind_speed = inf must be finite"),
-        (replaced('<scale value="500"/>', '<scale value="0"/>'), "scale = 0 must be greater than 0"),
-        (replaced("<film", "<fillm"), "not well-formed"),
-        (replaced('"3.0.0">', '"3.0.0"><bsdf type="diffuse" id="receiver"/>'), "duplicate"),
-        (lambda text: "", "not well-formed XML"),
-        (lambda text: '<shape type="sphere" version="3.0.0"/>', "has a root element <shape>: it must be <scene>"),
-        (lambda text: f"<scene version='3.0.0'>{'<shape>' * 50_000}{'</shape>' * 50_000}</scene>", "more than 64 deep"),
-    ],
+    (without("sensor"), "sensor: the scene has none"),
+    (without("emitter"), "emitters: the scene has 0 of which 0 are lidar_transmitter"),
+    (without("film"), "film: sensor 'receiver' has none; add a time_gated_film"),
+    (without("medium"), "ocean_surface 'surface': needs a layered_water as its interior medium"),
+    (without("integrator"), "integrator: the scene has no lidar integrator"),
+    (replaced("<film", '<float name="apertur_area" value="1"/><film'), "did you mean aperture_area"),
+    (replaced('id="transmitter"/>', 'id="transmitter"><float name="divergense" value="1"/></emitter>'), "divergense"),
+    (replaced('<float name="bin_width_ns"', '<float name="bin_with"'), "time_gated_film: there is no parameter"),
+    (replaced('name="wind_speed" value="3"', 'name="wind_speed" value=""'), "wind_speed = '' is empty"),
+    (replaced('"$bottom_reflectance"', '"1.2"'), "reflectance = 1.2 must lie between 0 and 1"),
+    (replaced('type="sediment"', 'type="sedimnt"'), "did you mean sediment"),
+    (replaced('type="lidar_transmitter"', 'type="lidar_transmiter"'), "did you mean lidar_transmitter"),
+    (replaced('"-$bottom_depth"', '"-$bottom_dept"'), "z = '-$bottom_dept' refers to an unknown parameter"),
+    (replaced('name="wind_speed" value="3"', 'name="wind_speed" value="inf"'), "wind_speed = inf must be finite"),
+    (replaced('<scale value="500"/>', '<scale value="0"/>'), "scale = 0 must be greater than 0"),
+    (replaced("<film", "<fillm"), "not well-formed"),
+    (replaced('"3.0.0">', '"3.0.0"><bsdf type="diffuse" id="receiver"/>'), "duplicate"),
+    (lambda text: "", "not well-formed XML"),
+    (lambda text: '<shape type="sphere" version="3.0.0"/>', "has a root element <shape>: it must be <scene>"),
+    (lambda text: f"<scene version='3.0.0'>{'<shape>' * 50_000}{'</shape>' * 50_000}</scene>", "more than 64 deep"),
 )
-def test_scene_files(tmp_path, folder, change, part):
+def test_scene_files(change, part, tmp_path, folder):
     path = tmp_path / "scene.xml"
     text = re.sub('name="(\\w+)" +value', r'name="\1" value', catalogue.scene_text("table1"))
     path.write_text(change(re.sub(r"<(float|string|integer) +name", r"<\1 name", text)), "utf-8")
@@ -209,12 +197,10 @@ def test_scene_files(tmp_path, folder, change, part):
 
 
 def quietly(**options):
-    """Return a call of render with two passes of table1 unless other options are given."""
     return lambda: mitransient_lidar.render(**{"scene": "table1", "passes": 2, **options})
 
 
 def as_dict(**parts):
-    """Return a call of render for a scene given as a dict."""
     return quietly(scene={"type": "scene", **parts})
 
 
@@ -224,40 +210,35 @@ for _ in range(100):
 SINGULAR = mi.ScalarTransform4f().scale(0)
 
 
-@each_row(
-    ("call", "sentence"),
-    [
-        (quietly(scene=3), "scene = 3 must be a shipped name, a path, a dict or a loaded scene"),
-        (quietly(passes="8"), "passes = '8' must be an integer between 2 and 1000000000"),
-        (quietly(passes=np.array([3, 4])), "passes = array([3, 4]) must be an integer"),
-        (quietly(variant=3), "variant = 3 is not supported"),
-        (quietly(integrator=3), "integrator = 3 must be the name or the dict of an integrator"),
-        (quietly(integrator={"type": "lidar_merging", "paths_per_pass": None}), "paths_per_pass = None must be"),
-        (quietly(params=["altitude"]), "params = ['altitude'] must be a dict of names and values"),
-        (quietly(params={"altitude": None}), "altitude = None must be a number, a text or a list"),
-        (quietly(params={3: 4}), "parameter 3 is not one of scene table1"),
-        (quietly(scene={}), "sensor: the scene has none"),
-        (quietly(scene={"type": "scene", "x": 3}, params={"a": 1}), "params = ['a'] need an XML scene"),
-        (as_dict(x=None), "x = None must be"),
-        (as_dict(x={"type": "sphere", "radius": None}), "x.radius = None must be"),
-        (as_dict(x={"type": "sphere", "radius": NAN}), "x.radius = nan must be finite"),
-        (as_dict(x={"type": "sphere", "to_world": SINGULAR}), "x.to_world has a scale of 0"),
-        (as_dict(x={"type": "multipixel_receiver", "aperture_area": 1e30}), "x.aperture_area = 1e+30 must lie between"),
-        (
-            as_dict(x={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 2, 0]}}),
-            "x.reflectance = 2 must lie between 0 and 1",
-        ),
-        (as_dict(x={"type": "diffuse", "reflectance": 1.5}), "x.reflectance = 1.5 must lie between 0 and 1"),
-        (as_dict(x={"type": "seabed", "dept": 3.0}), "seabed: there is no parameter dept; did you mean depth"),
-        (as_dict(**{"3": {3: 4}}), "scene: the key 3 must be a name"),
-        (as_dict(x=NESTED), "nested more than 64 deep"),
-        (lambda: mitransient_lidar.open("/dev/zero"), "/dev/zero: it is a device"),
-    ],
+@refuses(
+    (quietly(scene=3), "scene = 3 must be a shipped name, a path, a dict or a loaded scene"),
+    (quietly(passes="8"), "passes = '8' must be an integer between 2 and 1000000000"),
+    (quietly(passes=np.array([3, 4])), "passes = array([3, 4]) must be an integer"),
+    (quietly(variant=3), "variant = 3 is not supported"),
+    (quietly(integrator=3), "integrator = 3 must be the name or the dict of an integrator"),
+    (quietly(integrator={"type": "lidar_merging", "paths_per_pass": None}), "paths_per_pass = None must be"),
+    (quietly(params=["altitude"]), "params = ['altitude'] must be a dict of names and values"),
+    (quietly(params={"altitude": None}), "altitude = None must be a number, a text or a list"),
+    (quietly(params={3: 4}), "parameter 3 is not one of scene table1"),
+    (quietly(scene={}), "sensor: the scene has none"),
+    (quietly(scene={"type": "scene", "x": 3}, params={"a": 1}), "params = ['a'] need an XML scene"),
+    (as_dict(x=None), "x = None must be"),
+    (as_dict(x={"type": "sphere", "radius": None}), "x.radius = None must be"),
+    (as_dict(x={"type": "sphere", "radius": NAN}), "x.radius = nan must be finite"),
+    (as_dict(x={"type": "sphere", "to_world": SINGULAR}), "x.to_world has a scale of 0"),
+    (as_dict(x={"type": "multipixel_receiver", "aperture_area": 1e30}), "x.aperture_area = 1e+30 must lie between"),
+    (
+        as_dict(x={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 2, 0]}}),
+        "x.reflectance = 2 must lie between 0 and 1",
+    ),
+    (as_dict(x={"type": "diffuse", "reflectance": 1.5}), "x.reflectance = 1.5 must lie between 0 and 1"),
+    (as_dict(x={"type": "seabed", "dept": 3.0}), "seabed: there is no parameter dept; did you mean depth"),
+    (as_dict(**{"3": {3: 4}}), "scene: the key 3 must be a name"),
+    (as_dict(x=NESTED), "nested more than 64 deep"),
+    (lambda: mitransient_lidar.open("/dev/zero"), "/dev/zero: it is a device"),
 )
-def test_python_calls(folder, call, sentence):
-    with pytest.raises(UserError, match=re.escape(sentence)) as caught:
-        call()
-    assert "\n" not in str(caught.value)
+def test_python_calls(call, folder):
+    call()
 
 
 def test_exhausted_memory_is_one_sentence_and_other_runtime_errors_stay_bugs():
@@ -272,16 +253,3 @@ def test_exhausted_memory_is_one_sentence_and_other_runtime_errors_stay_bugs():
 
         with pytest.raises(kind, match=sentence):
             run_passes(render_pass, Goal(passes=2), seed=0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("library", "part"), [("/etc/passwd", "'/etc/passwd'"), ("/nowhere.so", "is not a file")])
-def test_another_library_than_llvm(tmp_path, library, part):
-    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": library}
-    command = [sys.executable, "-m", "mitransient_lidar", "render", "table1", "-o", str(tmp_path / "out")]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.splitlines()[-1].startswith("Dr") or "DRJIT_LIBLLVM_PATH" in done.stderr
-    assert part in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not (tmp_path / "out").exists()

@@ -170,7 +170,7 @@ def test_bad_values_are_refused_by_name(command, needed, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@each_row("command", FROM_FUNCTIONS)
+@each_row(*zip(FROM_FUNCTIONS))
 def test_help_shows_ranges_and_defaults(command):
     text = " ".join(run(command, "--help").stdout.split())
     for name, (_, option, default, parameter) in options_of(command).items():
@@ -211,9 +211,6 @@ def test_a_store_is_completed_with_its_options(tmp_path, monkeypatch):
     assert_refused(run("campaign", tmp_path, "--shard-size", 4), "--shard-size is fixed in the store")
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    list(RENAMED.items()),
-)
+@each_row(*list(RENAMED.items()))
 def test_former_names_are_refused_with_the_new_one(old, new):
     assert_refused(run(old, "a.nc"), f"the command {old} is now {new}")

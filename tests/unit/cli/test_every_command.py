@@ -45,13 +45,11 @@ OTHER_COMMANDS = {
 
 
 def commands(arguments):
-    """Return the commands of a table, some with the mark of the slow tier."""
     return [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in arguments]
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """File of a scene with waves, a target and a bottom."""
     path = tmp_path_factory.mktemp("scene") / "small.xml"
     text = catalogue.scene_text("fig13_2x2")
     integrator = '<integrator type="lidar_merging"/>'
@@ -62,7 +60,6 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def result(scene, tmp_path_factory):
-    """A rendered file of the scene."""
     folder = tmp_path_factory.mktemp("result")
     done = run("render", scene, *FLAT, "--passes", 2, "-o", folder, "-q")
     assert done.exit_code == 0, done.stderr
@@ -157,16 +154,7 @@ def test_command_without_a_result(command, tmp_path, monkeypatch):
 
 
 def test_every_command_is_run():
-    tested = {
-        *SCENE_COMMANDS,
-        *RESULT_COMMANDS,
-        *OTHER_COMMANDS,
-        "render",
-        "shots",
-        "compare",
-        "depth-bias",
-        "tpu",
-        "fit",
-    }
+    tested = {*SCENE_COMMANDS, *RESULT_COMMANDS, *OTHER_COMMANDS, "render", "shots", "compare"}
+    tested |= {"depth-bias", "tpu", "fit"}
     # The benchmark measures for minutes; its tests replace the renders. tests/system runs campaigns and flights.
     assert set(COMMANDS) == tested | {"bench", "campaign", "fly", "scenes list", "scenes show", "scenes copy"}

@@ -15,7 +15,6 @@ TRAIN = ("--start-ns", 1480, "--width-ns", 5, "--count", 6)
 
 @pytest.fixture
 def stored(tmp_path):
-    """A small imager's result, in a file."""
     dataset = result(12, (3, 4), pulse_fwhm_ns=4.0)
     results.save(dataset, tmp_path / "scene.nc")
     return tmp_path / "scene.nc", dataset
@@ -59,20 +58,6 @@ def test_all_kinds_of_files_in_a_new_folder(stored, tmp_path):
     names = ["scene_gates.exr", "scene_gates.gif", "scene_gates.html", *numbered]
     assert done.stdout.split() == [str(folder / name) for name in names]
     assert sorted(file.name for file in folder.iterdir()) == sorted(names)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "part"),
-    [
-        ((), "one start"),
-        (("--start-ns", 1410), "one shape"),
-        (("--start-ns", 1406, "--width-ns", 5), "gate train before the surface"),
-        (("--start-ns", 1550, "--width-ns", 5, "--count", 3), "within the record"),
-    ],
-)
-def test_sentences(stored, arguments, part):
-    command_line.assert_refused(run(stored[0], *arguments), part)
 
 
 def test_a_stack_of_gates_has_no_histogram(stored):

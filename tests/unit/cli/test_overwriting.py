@@ -51,11 +51,7 @@ CASES = {
     "shots": (["table1", *WRONG, "-o", "d/s.nc", "--figure", "d/f.svg"], ["d/s.nc", "d/f.svg", "d/f.nc"], OTHER),
     "find-shots": figure("table1", files=["png"]),
     "detect": figure("fig13_2x2", files=("pdf", "nc")),
-    "depth-bias": (
-        ["riegl_vq840g", *WRONG, "-o", "d/t.nc", "--figure", "d/t.png"],
-        ["d/t.nc", "d/t.png"],
-        INSTRUMENT,
-    ),
+    "depth-bias": (["riegl_vq840g", *WRONG, "-o", "d/t.nc", "--figure", "d/t.png"], ["d/t.nc", "d/t.png"], INSTRUMENT),
     "tpu": (
         ["riegl_vq840g", *WRONG, "-o", "d"],
         [f"d/riegl_vq840g_{end}" for end in ("tpu.nc", "150m_20deg_tvu.csv", "150m_20deg_orders.png")],
@@ -95,7 +91,6 @@ FILES = [(name, file) for name, (_, targets, _) in CASES.items() for file in tar
 
 
 def words(name):
-    """Return the words of a case's command."""
     return name if name in COMMANDS else name.split()[0]
 
 
@@ -116,7 +111,6 @@ def folder(tmp_path, monkeypatch, small_result):
 
 @pytest.fixture(scope="module")
 def small_result(tmp_path_factory):
-    """A result, as a script saves it."""
     path = tmp_path_factory.mktemp("result") / "shot.nc"
     results.save(synthetic_shots.result(scene="table1"), path)
     return path
@@ -149,7 +143,6 @@ def write_before(monkeypatch):
 
 
 def change_mark(path, **values):
-    """Write a file anew with another mark."""
     mark = {**read_mark(path), **values}
     path.write_bytes(b"contents \0\0\0\0IEND startxref ;")
     write_mark(path, mark)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from rows import each_case
 
 from mitransient_lidar.core import files
 from mitransient_lidar.core.errors import UserError
@@ -105,11 +106,8 @@ def test_a_failure_while_files_are_moved_restores_the_former_ones(tmp_path, monk
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("event", "kept"),
-    [("a.txt", {"b.txt": "old"}), ("b.txt", {"b.txt": "old"}), ("moving", {"a.txt": "new", "b.txt": "old"})],
-)
-def test_the_next_run_sweeps_what_a_killed_one_left(tmp_path, event, kept):
+@each_case(("a.txt", {"b.txt": "old"}), ("b.txt", {"b.txt": "old"}), ("moving", {"a.txt": "new", "b.txt": "old"}))
+def test_the_next_run_sweeps_what_a_killed_one_left(event, kept, tmp_path):
     (tmp_path / "b.txt").write_text("old")
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), event], check=False, timeout=60)
     assert killed.returncode == -signal.SIGKILL
@@ -142,7 +140,6 @@ def test_leftovers_of_a_dead_process_are_removed(tmp_path, dead):
 
 
 def test_no_leftover_moves_or_removes_a_file_of_another_name(tmp_path, dead):
-    """A list of moves once did, in any folder that a command wrote into; a link would reach another folder."""
     victim = tmp_path / "victim"
     victim.mkdir()
     (victim / "a").write_text("old")
@@ -162,14 +159,6 @@ def test_leftovers_of_another_user_stay(tmp_path, dead, monkeypatch):
     monkeypatch.setattr(files.os, "getuid", lambda: os.stat(tmp_path).st_uid + 1)
     write(tmp_path, "c")
     assert contents(tmp_path) == {name: "theirs", "c": "new"}
-
-
-@pytest.fixture
-def default_ctrl_c():
-    """Python's own handler: a shell that starts the tests in the background leaves Ctrl-C ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("presses", [1, 2])

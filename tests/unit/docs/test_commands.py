@@ -48,7 +48,7 @@ def parameters(scene: str) -> set[str]:
     return set(catalogue.scene_parameters(catalogue.example_files().get(scene, scene), by_id=True))
 
 
-@each_row("page", [page for page in PAGES if commands(page)], ids=lambda page: f"{page.parent.name}/{page.stem}")
+@each_row(*zip([page for page in PAGES if commands(page)]))
 def test_commands_options_and_parameters_exist(page: Path) -> None:
     for arguments in commands(page):
         text = " ".join(arguments)
@@ -62,7 +62,7 @@ def test_commands_options_and_parameters_exist(page: Path) -> None:
             assert not unknown, f"{text}: {unknown}"
 
 
-@each_row("page", [page for page in PAGES if commands(page)], ids=lambda page: f"{page.parent.name}/{page.stem}")
+@each_row(*zip([page for page in PAGES if commands(page)]))
 def test_files_that_commands_read_are_shipped_or_written(page: Path) -> None:
     made: set[str] = set()
     for arguments in commands(page):

@@ -1,5 +1,8 @@
-"""Pages of the documentation: all are in a table of contents, and their relative links lead to files."""
+"""Pages and gallery: contents, links, pictures, words of the search, and the table of the validation."""
 
+import ast
+import csv
+import importlib
 import re
 from pathlib import Path
 
@@ -21,7 +24,6 @@ def is_generated(path: Path) -> bool:
 
 
 def pages() -> list[Path]:
-    """Return the pages that are written by hand."""
     found = [path for suffix in ("md", "rst") for path in DOCS.rglob(f"*.{suffix}")]
     return [page for page in found if page.relative_to(DOCS).parts[0] not in _SOURCES and not is_generated(page)]
 
@@ -40,11 +42,7 @@ def test_every_page_is_in_one_table_of_contents() -> None:
     assert set(pages()) - listed == {DOCS / "index.md"}
 
 
-@each_row(
-    "page",
-    [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *pages()],
-    ids=lambda page: page.relative_to(ROOT).as_posix(),
-)
+@each_row(*zip(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *zip(pages()))
 def test_relative_links_lead_to_files(page: Path) -> None:
     text = re.sub(r"^( *)```.*?^\1```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     targets = re.findall(r"\]\(<?([^)\s#>]+)[^)]*\)", text)
@@ -69,12 +67,9 @@ def test_entries_of_the_changelog_are_short_and_sorted() -> None:
 
 
 @each_row(
-    ("word", "page"),
-    [
-        *(("TPU", "guide/uncertainty"), ("S-44", "guide/uncertainty"), ("GPU", "install"), ("macOS", "install")),
-        *(("Windows", "install"), ("tutorial", "gallery/ten_minutes"), ("GeoTIFF", "guide/shore")),
-        *(("bathymetry", "glossary"), ("hydrography", "glossary"), ("shore", "glossary")),
-    ],
+    *(("TPU", "guide/uncertainty"), ("S-44", "guide/uncertainty"), ("GPU", "install"), ("macOS", "install")),
+    *(("Windows", "install"), ("tutorial", "gallery/ten_minutes"), ("GeoTIFF", "guide/shore")),
+    *(("bathymetry", "glossary"), ("hydrography", "glossary"), ("shore", "glossary")),
 )
 def test_words_of_a_search_are_headings_or_terms(word: str, page: str) -> None:
     """The site's search ranks these first."""
@@ -91,3 +86,68 @@ def test_pages_of_search_words_have_them_in_the_text() -> None:
 def test_every_picture_is_on_a_page() -> None:
     text = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "README.md", *pages()))
     assert [path.name for path in (DOCS / "images").glob("*.png") if f"images/{path.name})" not in text] == []
+
+
+FOLDER = Path(__file__).parents[3] / "docs" / "validation"
+with (FOLDER / "cases.csv").open(newline="") as file:
+    ROWS = list(csv.DictReader(file))
+
+
+def test_the_page_shows_the_table():
+    lines = [line for line in (FOLDER / "index.md").read_text().splitlines() if line.startswith("| ")]
+    shown = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[1:]]
+    assert shown == [[row[name] for name in row if name != "case"] for row in ROWS]
+
+
+def test_the_script_finds_what_it_takes_from_tests(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "analytic")
+    text = (FOLDER / "validate.py").read_text("utf-8")
+    modules = re.findall(r"^import (test_\w+) as (\w+)", text, re.MULTILINE)
+    assert len(modules) == 3
+    for module, alias in modules:
+        found = importlib.import_module(module)
+        assert [name for name in re.findall(rf"\b{alias}\.(\w+)", text) if not hasattr(found, name)] == []
+
+
+GALLERY = Path(__file__).parents[3] / "docs" / "gallery"
+SCRIPTS = sorted(GALLERY.glob("*.py"))
+
+
+def test_header_links_every_script_once():
+    text = (GALLERY / "GALLERY_HEADER.rst").read_text(encoding="utf-8")
+    linked = re.findall(r"<sphx_glr_auto_gallery_(\w+\.py)>", text)
+    assert sorted(linked) == [script.name for script in SCRIPTS]
+    assert len(linked) >= 20
+
+
+@each_row(*zip(SCRIPTS))
+def test_script_has_title_introduction_figure_and_conclusion(script):
+    text = script.read_text(encoding="utf-8")
+    module = ast.parse(text)
+    title, line, blank, *introduction = ast.get_docstring(module).splitlines()
+    assert set(line) == {"="}
+    assert len(line) == len(title)
+    assert not blank
+    assert " ".join(introduction)
+    calls = [ast.unparse(node.func) for node in ast.walk(module) if isinstance(node, ast.Call)]
+    assert "plt.subplots" in calls
+    assert calls.count("plt.show") == calls.count("plt.subplots")
+    assert "print" in calls
+    assert re.search(r"^# \*\*What to see\.\*\* ", text, re.MULTILINE)
+
+
+@each_row(*zip(SCRIPTS))
+def test_blocks_of_text_are_comments_up_to_the_code(script):
+    """A line of text that lacks its # would run as code, a title without its blank lines would be no heading."""
+    for block in re.split(r"^# %%.*\n", script.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]:
+        comment = re.match(r"(#.*\n)*", block).group(0)
+        rest = block[len(comment) :]
+        assert not comment or not rest or rest.startswith("\n")
+        assert rest.strip() or comment
+
+
+@each_row(*zip(SCRIPTS))
+def test_files_are_written_into_temporary_folders(script):
+    text = script.read_text(encoding="utf-8")
+    writes = re.search(r"savefig|write_text|np\.savez?|to_netcdf|\.sweep\(|\.fly\(", text)
+    assert not writes or "tempfile.TemporaryDirectory()" in text

@@ -60,7 +60,7 @@ def _platform(roll, pitch, yaw, vector):
     return _turned((0, 0, -1), yaw, turned)
 
 
-@each_row(("angles", "scanner", "expected"), POSES)
+@each_row(*POSES)
 def test_beams_of_arinc_705(angles, scanner, expected, tmp_path):
     file = tmp_path / "flight.trj"
     roll, pitch, yaw = angles

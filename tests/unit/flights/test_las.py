@@ -13,7 +13,7 @@ import pyproj
 import pytest
 import xarray as xr
 from oracles import las_reader
-from rows import each_row
+from rows import each_case, each_row, must_refuse
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError, WriteError
@@ -61,7 +61,6 @@ def points() -> xr.Dataset:
 
 @pytest.fixture
 def waveforms() -> xr.Dataset:
-    """Counts of each pixel of each shot."""
     counts = np.random.default_rng(6).integers(0, 4096, (SHOTS * PIXELS, SAMPLES)).astype(np.uint16)
     return waveform_dataset(counts)
 
@@ -83,9 +82,6 @@ def chunks(points: xr.Dataset, waveforms: xr.Dataset, pulses: int) -> tuple[list
 
 def read_column(file: las_reader.LasFile, name: str) -> np.ndarray:
     return np.array([point.extra.get(name, getattr(point, name, None)) for point in file.points])
-
-
-# Points
 
 
 @pytest.mark.parametrize("point_format", [6, 9])
@@ -118,18 +114,13 @@ def test_read_from_the_specification(
         np.testing.assert_array_equal(read_column(file, name).astype(np.float32), points[name].astype(np.float32))
 
 
-@pytest.mark.parametrize(
-    ("system", "less", "bit", "text"),
-    [
-        ("flight", 0, 0, "as in the trajectory of the flight, not of a known GPS week"),
-        ("gps_week", 0, 0, "seconds of the GPS week"),
-        ("adjusted_gps", 0, 1, "adjusted standard GPS time"),
-        ("gps", 1e9, 1, "adjusted standard GPS time"),
-    ],
+@each_case(
+    ("flight", 0, 0, "as in the trajectory of the flight, not of a known GPS week"),
+    ("gps_week", 0, 0, "seconds of the GPS week"),
+    ("adjusted_gps", 0, 1, "adjusted standard GPS time"),
+    ("gps", 1e9, 1, "adjusted standard GPS time"),
 )
-def test_times_their_type_and_the_notes_agree(
-    tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset, system: str, less: float, bit: int, text: str
-) -> None:
+def test_times_their_type_and_the_notes_agree(system, less, bit, text, tmp_path, points, waveforms):
     """Adjusted standard GPS time is GPS time less 10^9 s (LAS 1.4 R15, table 4, bit 0 of the global encoding)."""
     points["gps_time"] = points["gps_time"] + less + 1000
     points["gps_time"].attrs["time_system"] = system
@@ -203,14 +194,11 @@ def test_compressed_points_are_those_without_compression(tmp_path: Path, points:
     np.testing.assert_array_equal(compressed["shot"], points["shot"])
 
 
-@each_row("crs", ["EPSG:32633", "EPSG:32633+5773"])
-def test_coordinate_system_by_code(tmp_path: Path, points: xr.Dataset, crs: str) -> None:
+@each_row("EPSG:32633", "EPSG:32633+5773")
+def test_coordinate_system_by_code(crs, tmp_path, points):
     write_points(tmp_path / "points.las", points, crs)
     record = las_reader.read(tmp_path / "points.las").records["LASF_Projection", 2112]
     assert pyproj.CRS.from_wkt(record.rstrip(b"\0").decode()).equals(pyproj.CRS(crs), ignore_axis_order=True)
-
-
-# Coordinate systems
 
 
 @pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:2263", "EPSG:4978", "EPSG:99999999", "somewhere"])
@@ -226,9 +214,6 @@ def test_web_mercator_is_refused_where_its_metres_are_not_those_on_the_ground(tm
     with pytest.raises(UserError, match=r"crs = 'EPSG:3857' has coordinates in .*Mercator, .* are 1\.887 times"):
         write_points(tmp_path / "points.las", moved, "EPSG:3857")
     assert not any(tmp_path.iterdir())
-
-
-# Waveforms
 
 
 def test_packets(tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset) -> None:
@@ -321,57 +306,44 @@ def test_samples_lie_on_the_refracted_ray(tmp_path: Path, points: xr.Dataset, wa
     assert las_reader.sample_position(returns, 1e3 * (lead_ns + water_ns + 10))[2] < -depth - 0.5
 
 
-# Wrong input
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("x", np.nan, "x holds nan"),
-        ("z", np.inf, "z holds inf"),
-        ("y", 1e10, "y = 1e+10 m must be within 2147 km of 6.5e+06 m"),
-        ("gps_time", np.nan, "gps_time holds nan"),
-        ("return_number", 3, "return_number = 3 must be at most number_of_returns, 2"),
-        ("number_of_returns", 16, "number_of_returns = 16 must lie between 1 and 15"),
-        ("return_number", 0, "return_number = 0 must lie between 1 and 15"),
-        ("kind", 256, "kind = 256 must lie between 0 and 255"),
-        ("scan_angle_deg", -181, "scan_angle_deg = -181 must lie between -180 and 180"),
-        ("pixel", 65536, "pixel = 65536 must lie between 0 and 65535"),
-        ("quality", 256, "quality = 256 must lie between 0 and 255"),
-        ("channel", 4, "channel = 4 must lie between 0 and 3"),
-        ("shot", -1, "shot = -1 must lie between 0 and 4294967295"),
-        ("line", 70000, "line = 70000 must lie between 0 and 65535"),
-        ("packet", 240, "packet = 240 must lie between -1, for none, and 239, the last packet"),
-        ("time_in_packet_ns", np.nan, "time_in_packet_ns holds nan"),
-        ("direction", 0.5, "direction has the length"),
-    ],
+@each_case(
+    ("x", np.nan, "x holds nan"),
+    ("z", np.inf, "z holds inf"),
+    ("y", 1e10, "y = 1e+10 m must be within 2147 km of 6.5e+06 m"),
+    ("gps_time", np.nan, "gps_time holds nan"),
+    ("return_number", 3, "return_number = 3 must be at most number_of_returns, 2"),
+    ("number_of_returns", 16, "number_of_returns = 16 must lie between 1 and 15"),
+    ("return_number", 0, "return_number = 0 must lie between 1 and 15"),
+    ("kind", 256, "kind = 256 must lie between 0 and 255"),
+    ("scan_angle_deg", -181, "scan_angle_deg = -181 must lie between -180 and 180"),
+    ("pixel", 65536, "pixel = 65536 must lie between 0 and 65535"),
+    ("quality", 256, "quality = 256 must lie between 0 and 255"),
+    ("channel", 4, "channel = 4 must lie between 0 and 3"),
+    ("shot", -1, "shot = -1 must lie between 0 and 4294967295"),
+    ("line", 70000, "line = 70000 must lie between 0 and 65535"),
+    ("packet", 240, "packet = 240 must lie between -1, for none, and 239, the last packet"),
+    ("time_in_packet_ns", np.nan, "time_in_packet_ns holds nan"),
+    ("direction", 0.5, "direction has the length"),
 )
-def test_wrong_points(
-    tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset, name: str, value: float, message: str
-) -> None:
+def test_wrong_points(name, value, message, tmp_path, points, waveforms):
     path = tmp_path / "waveforms.las"
     path.write_text("former")
     points[name].values[7] = value
-    with pytest.raises(UserError, match=re.escape(message)):
-        write_waveforms(path, points, waveforms)
+    must_refuse(re.escape(message), write_waveforms, path, points, waveforms)
     assert path.read_text() == "former"
     assert list(tmp_path.iterdir()) == [path]
 
 
 @each_row(
-    ("changes", "message"),
-    [
-        ({"gain": 0.0}, "gain = 0 must be greater than 0"),
-        ({"offset": np.nan}, "offset = nan"),
-        ({"sampling_ns": 0.8333}, "sampling_ns = 0.8333 must be a whole number of picoseconds"),
-        ({"sampling_ns": -1.0}, "sampling_ns = -1 must be greater than 0"),
-        ({"gain": 1e-6}, "must lie between -0.05 and 0.015535 V"),
-    ],
+    ({"gain": 0.0}, "gain = 0 must be greater than 0"),
+    ({"offset": np.nan}, "offset = nan"),
+    ({"sampling_ns": 0.8333}, "sampling_ns = 0.8333 must be a whole number of picoseconds"),
+    ({"sampling_ns": -1.0}, "sampling_ns = -1 must be greater than 0"),
+    ({"gain": 1e-6}, "must lie between -0.05 and 0.015535 V"),
 )
-def test_wrong_waveforms(tmp_path: Path, points: xr.Dataset, changes: dict[str, float], message: str) -> None:
+def test_wrong_waveforms(changes, message, tmp_path, points):
     values = waveform_dataset(np.full((SHOTS * PIXELS, SAMPLES), 0.5), **changes)
-    with pytest.raises(UserError, match=re.escape(message)):
-        write_waveforms(tmp_path / "waveforms.las", points, values)
+    must_refuse(re.escape(message), write_waveforms, tmp_path / "waveforms.las", points, values)
     assert not any(tmp_path.iterdir())
 
 
@@ -382,8 +354,7 @@ def test_later_waveforms_that_differ(tmp_path: Path, points: xr.Dataset, wavefor
         (waveform_dataset(np.zeros((20, SAMPLES)), gain=1e-3), "gain = 0.001 must be that of the first waveforms"),
     ):
         packets[1] = second
-        with pytest.raises(UserError, match=re.escape(message)):
-            write_waveforms(tmp_path / "waveforms.las", parts, packets)
+        must_refuse(re.escape(message), write_waveforms, tmp_path / "waveforms.las", parts, packets)
         assert not any(tmp_path.iterdir())
 
 

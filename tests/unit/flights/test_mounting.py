@@ -31,21 +31,17 @@ def test_level_flight_has_circles_on_the_sea():
 
 
 @each_row(
-    ("trajectory", "mounting", "expected"),
-    # Nadir pulse of 200 m height, north: where it meets the sea, for angles whose tangent is 0.1.
-    [
-        (_level(roll_deg=np.degrees(np.arctan(0.1))), Mounting(), (-20, 0)),
-        (_level(pitch_deg=np.degrees(np.arctan(0.1))), Mounting(), (0, 20)),
-        (_level(), Mounting(roll_deg=np.degrees(np.arctan(0.1))), (-20, 0)),
-        (_level(), Mounting(pitch_deg=np.degrees(np.arctan(0.1))), (0, 20)),
-        # East: left is north.
-        (_level(heading_deg=90), Mounting(roll_deg=np.degrees(np.arctan(0.1))), (0, 20)),
-        (_level(heading_deg=90), Mounting(pitch_deg=np.degrees(np.arctan(0.1))), (20, 0)),
-        # The pitch of the mounting is turned by its yaw to the right.
-        (_level(), Mounting(pitch_deg=np.degrees(np.arctan(0.1)), yaw_deg=90), (20, 0)),
-        # Equal angles of platform and mounting add up: tan(2 arctan 0.1) = 0.2 / 0.99.
-        (_level(pitch_deg=np.degrees(np.arctan(0.1))), Mounting(pitch_deg=np.degrees(np.arctan(0.1))), (0, 40 / 0.99)),
-    ],
+    (_level(roll_deg=np.degrees(np.arctan(0.1))), Mounting(), (-20, 0)),
+    (_level(pitch_deg=np.degrees(np.arctan(0.1))), Mounting(), (0, 20)),
+    (_level(), Mounting(roll_deg=np.degrees(np.arctan(0.1))), (-20, 0)),
+    (_level(), Mounting(pitch_deg=np.degrees(np.arctan(0.1))), (0, 20)),
+    # East: left is north.
+    (_level(heading_deg=90), Mounting(roll_deg=np.degrees(np.arctan(0.1))), (0, 20)),
+    (_level(heading_deg=90), Mounting(pitch_deg=np.degrees(np.arctan(0.1))), (20, 0)),
+    # The pitch of the mounting is turned by its yaw to the right.
+    (_level(), Mounting(pitch_deg=np.degrees(np.arctan(0.1)), yaw_deg=90), (20, 0)),
+    # Equal angles of platform and mounting add up: tan(2 arctan 0.1) = 0.2 / 0.99.
+    (_level(pitch_deg=np.degrees(np.arctan(0.1))), Mounting(pitch_deg=np.degrees(np.arctan(0.1))), (0, 40 / 0.99)),
 )
 def test_signs_of_roll_pitch_and_yaw(trajectory, mounting, expected):
     np.testing.assert_allclose(_ground(pulse_poses(trajectory, mounting, Fixed(), [0.5])), [expected], atol=1e-11)

@@ -8,12 +8,7 @@ from significance import largest_count
 
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.flights.recording import (
-    chosen_settings,
-    pooled_errors,
-    record,
-    saturated_pulses,
-)
+from mitransient_lidar.flights.recording import chosen_settings, pooled_errors, record, saturated_pulses
 
 FLIGHT = {"scene": "flight", "platform": {}, "scanner": {}, "pulses": {"rate_hz": 100}}
 

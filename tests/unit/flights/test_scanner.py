@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, refuses
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
 from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.poses.trajectory import Trajectory
@@ -19,9 +18,9 @@ def _azimuth_deg(axis):
     return np.degrees(np.arctan2(axis[:, 0], axis[:, 1]))
 
 
-@each_row("given", ALL)
-@each_row("pixels", ["scan", "platform"])
-def test_sides_are_orthonormal(given, pixels):
+@each_row(*zip(ALL))
+@each_row("scan", "platform")
+def test_sides_are_orthonormal(pixels, given):
     axis, far, left = Scanner.of_table({**given, "pixels": pixels}).directions(np.linspace(0, 1, 401))
     for one in (axis, far, left):
         np.testing.assert_allclose(np.linalg.norm(one, axis=1), 1, atol=1e-14)
@@ -46,14 +45,10 @@ def test_palmer_turns_clockwise_at_its_rate_from_its_phase():
     np.testing.assert_allclose(back[0, :2], (-sin, 0), atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("wave", "expected"),
-    # Eighths of a cycle of 0.1 s about the azimuth 90, to 90 degrees on each side.
-    [
-        ("triangular", [90, 135, 180, 135, 90, 45, 0, 45]),
-        ("sinusoidal", 90 + 90 * np.sin(np.arange(8) * np.pi / 4)),
-        ("sawtooth", [0, 22.5, 45, 67.5, 90, 112.5, 135, 157.5]),
-    ],
+@each_row(
+    ("triangular", [90, 135, 180, 135, 90, 45, 0, 45]),
+    ("sinusoidal", 90 + 90 * np.sin(np.arange(8) * np.pi / 4)),
+    ("sawtooth", [0, 22.5, 45, 67.5, 90, 112.5, 135, 157.5]),
 )
 def test_semi_arc_to_the_right(wave, expected):
     scanner = Scanner.of_table({**ARC, "centre_deg": 90, "wave": wave})
@@ -79,9 +74,9 @@ def test_raster_visits_each_point_in_turn():
     np.testing.assert_allclose(across, [*np.tile([-10, -5, 0, 5, 10], 3), -10], atol=1e-12)
 
 
-@each_row("start", [0.0, 302_400.123, 604_799.0, 340_000_000.25, 1.38e9 + 0.1, 1.38e9 + 0.7654321])
-@each_row("rate", [1000.0, 200_000.0])
-def test_raster_keeps_its_points_at_gps_times(start, rate):
+@each_row(0.0, 302_400.123, 604_799.0, 340_000_000.25, 1.38e9 + 0.1, 1.38e9 + 0.7654321)
+@each_row(1000.0, 200_000.0)
+def test_raster_keeps_its_points_at_gps_times(rate, start):
     """Times since 1980 are rounded by 0.1 us, a fiftieth of the interval of 200 kHz."""
     scanner = Scanner.of_table({**RASTER, "lines": 20, "points": 50, "rate_hz": rate / 1000})
     line = Trajectory(np.array([start, start + 1.0]), np.zeros((2, 3)), *np.zeros((3, 2)))
@@ -103,15 +98,11 @@ def test_every_line_of_a_flight_begins_with_a_whole_point():
         assert len(np.unique(poses.axis[poses.line == line][:1000].round(9), axis=0)) == 1000
 
 
-@each_row(
-    ("given", "message"),
-    [
-        ({}, "has no kind"),
-        ({"kind": ["palmer"]}, r"kind = \['palmer'\] of a scanner must be one of"),
-        ({"kind": "spiral"}, "kind = 'spiral' of a scanner must be one of palmer, semi_arc"),
-        ({**RASTER, "lines": 10**5, "points": 10**5}, "must be at most 1000000000"),
-    ],
+@refuses(
+    ({}, "has no kind"),
+    ({"kind": ["palmer"]}, r"kind = \['palmer'\] of a scanner must be one of"),
+    ({"kind": "spiral"}, "kind = 'spiral' of a scanner must be one of palmer, semi_arc"),
+    ({**RASTER, "lines": 10**5, "points": 10**5}, "must be at most 1000000000"),
 )
-def test_invalid_scanners(given, message):
-    with pytest.raises(UserError, match=message):
-        Scanner.of_table(given)
+def test_invalid_scanners(given):
+    Scanner.of_table(given)

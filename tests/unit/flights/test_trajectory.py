@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import significance
-from rows import each_row
+from rows import each_row, refuses
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
@@ -134,41 +134,33 @@ def test_noise_of_attitudes_is_stationary_with_its_correlation():
     assert (np.abs(crossed) < largest_z(count, 3) / np.sqrt(count)).all()
 
 
-@each_row(
-    ("times", "yaw", "message"),
-    [
-        ([0, 1, 0.5, 2], None, r"record 3 of a trajectory: time = 0.5 s must be later than .* before, 1.0 s"),
-        ([0, 1, 1], None, "record 3 of a trajectory"),
-        ([0, 1, 2], [0, np.nan, 0], "record 2 of a trajectory: yaw = nan must be a number from -1e\\+12 to 1e\\+12"),
-        ([0, np.inf], None, "record 2 of a trajectory: time = inf"),
-        ([0, 1], ["north", "east"], r"yaw_deg = \['north', 'east'\] must hold numbers only"),
-        ([0], None, "number of records of 1: it must be at least 2"),
-        ([0, 1], [0, 1, 2], r"yaw_deg has the shape \(3,\): it must be \(2,\)"),
-    ],
+@refuses(
+    ([0, 1, 0.5, 2], None, r"record 3 of a trajectory: time = 0.5 s must be later than .* before, 1.0 s"),
+    ([0, 1, 1], None, "record 3 of a trajectory"),
+    ([0, 1, 2], [0, np.nan, 0], "record 2 of a trajectory: yaw = nan must be a number from -1e\\+12 to 1e\\+12"),
+    ([0, np.inf], None, "record 2 of a trajectory: time = inf"),
+    ([0, 1], ["north", "east"], r"yaw_deg = \['north', 'east'\] must hold numbers only"),
+    ([0], None, "number of records of 1: it must be at least 2"),
+    ([0, 1], [0, 1, 2], r"yaw_deg has the shape \(3,\): it must be \(2,\)"),
 )
-def test_invalid_records(times, yaw, message):
-    with pytest.raises(UserError, match=message):
-        _trajectory(times, yaw)
+def test_invalid_records(times, yaw):
+    _trajectory(times, yaw)
 
 
-@each_row("time", [-0.1, 1.5, 4.1])
+@each_row(-0.1, 1.5, 4.1)
 def test_times_on_no_line_are_refused(time):
     trajectory = _trajectory(np.arange(5), lines=[(0, 1), (2, 4)])
     with pytest.raises(UserError, match=rf"time = {time:g} s \(number 2\) is on no flight line: .* 0 to 1 s, 2 to 4 s"):
         trajectory.at([0.5, time])
 
 
-@each_row(
-    ("given", "message"),
-    [
-        ({}, r"\[platform\] has no kind"),
-        ({"kind": "kite"}, "kind = 'kite' of a platform must be one of lines, mast, csv, sbet"),
-        ({**LINES, "duration_s": 3}, "must have either length or duration_s"),
-        (_without(LINES, "length"), "must have either length or duration_s"),
-        ({**LINES, "count": 2}, "has no spacing"),
-        ({**LINES, "noise": {"roll_deg": 1, "correlation_s": 1e-7}}, "noise.correlation_s = 1e-07 must be at least"),
-    ],
+@refuses(
+    ({}, r"\[platform\] has no kind"),
+    ({"kind": "kite"}, "kind = 'kite' of a platform must be one of lines, mast, csv, sbet"),
+    ({**LINES, "duration_s": 3}, "must have either length or duration_s"),
+    (_without(LINES, "length"), "must have either length or duration_s"),
+    ({**LINES, "count": 2}, "has no spacing"),
+    ({**LINES, "noise": {"roll_deg": 1, "correlation_s": 1e-7}}, "noise.correlation_s = 1e-07 must be at least"),
 )
-def test_invalid_platforms(given, message):
-    with pytest.raises(UserError, match=message):
-        platform_of(given).trajectory()
+def test_invalid_platforms(given):
+    platform_of(given).trajectory()

@@ -1,7 +1,7 @@
 import numpy as np
 import pyproj
 import pytest
-from rows import each_row
+from rows import each_case, each_row, must_refuse, refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.platforms import platform_of
@@ -18,8 +18,6 @@ def _write(path, heading, order, separator=","):
 
 
 @each_row(
-    ("heading", "order", "separator"),
-    [
         ([], NAMES, ","),
         (['#HEADER: "t", "roll", "pitch", "yaw", "x", "y", "z"'], NAMES, ", "),
         (["# a comment", "#TIME_COLUMN: 0", '#HEADER: "t", "x", "y", "z", "yaw", "roll", "pitch"'],
@@ -29,10 +27,8 @@ def _write(path, heading, order, separator=","):
          ("x", "y", "z", "t", "roll", "pitch", "yaw"), ","),
         (["time_s;x_m;y_m;z_m;roll_deg;pitch_deg;heading_deg"],
          ("t", "x", "y", "z", "roll", "pitch", "yaw"), ";"),
-        (["t x y z yaw roll pitch"], ("t", "x", "y", "z", "yaw", "roll", "pitch"), " "),
-    ],
-)  # fmt: skip
-def test_text_in_any_order(tmp_path, heading, order, separator):
+        (["t x y z yaw roll pitch"], ("t", "x", "y", "z", "yaw", "roll", "pitch"), " "),)  # fmt: skip
+def test_text_in_any_order(heading, order, separator, tmp_path):
     records = read_text_records(_write(tmp_path / "flight.trj", heading, order, separator))
     found = np.column_stack([records.time_s, records.roll_deg, records.pitch_deg, records.yaw_deg, records.position])
     np.testing.assert_array_equal(found, ROWS)
@@ -58,36 +54,31 @@ def test_files_of_a_plan_have_an_origin_and_lines(tmp_path):
     np.testing.assert_array_equal(trajectory.at([0.25, 1.25]).line, [0, 1])
 
 
-@each_row(
-    ("text", "message"),
-    [
-        ("0,0,0,0,0,0,0\n\n1,0,0,0,0,0,0\n0.5,0,0,0,0,0,0\n", r"line 4: time = 0.5 s must be later .* before, 1.0 s"),
-        ("0,0,0,0,0,0,0\n1,0,0,nan,0,0,0\n", "line 2: yaw = nan must be a number from -1e\\+12 to 1e\\+12"),
-        ("0,0,0,0,0,0,0\n1,0,0,0,0,0\n", "line 2: z = nan must be a number"),
-        ("0,0,0,0,0,0,0\n1,0,0,east,0,0,0\n", "is not a table of t, roll, .*: line 2 is '1,0,0,east,0,0,0'"),
-        (
-            "t,roll,pitch,course,x,y,z\n0,0,0,0,0,0,0\n",
-            r"unknown column 'course' .*: allowed are t \[s, ms, us\], roll, pitch, yaw \[deg, rad\]",
-        ),
-        ("t,roll,pitch,x,y,z\n0,0,0,0,0,0\n", "columns t, roll, pitch, x, y, z: it must have yaw, and each of"),
-        ("#TIME_COLUMN: first\n0,0,0,0,0,0,0\n", "TIME_COLUMN = 'first' must be an integer"),
-        ("0,0,0,0,0,0,0\n", "number of records of 1: it must be at least 2"),
-        ("", "has no rows of numbers"),
-        ("t,roll_grad,pitch,yaw,x,y,z\n0,0,0,0,0,0,0\n", r"unknown unit in column 'roll_grad' .*\[deg, rad\]"),
-    ],
+@refuses(
+    ("0,0,0,0,0,0,0\n\n1,0,0,0,0,0,0\n0.5,0,0,0,0,0,0\n", r"line 4: time = 0.5 s must be later .* before, 1.0 s"),
+    ("0,0,0,0,0,0,0\n1,0,0,nan,0,0,0\n", "line 2: yaw = nan must be a number from -1e\\+12 to 1e\\+12"),
+    ("0,0,0,0,0,0,0\n1,0,0,0,0,0\n", "line 2: z = nan must be a number"),
+    ("0,0,0,0,0,0,0\n1,0,0,east,0,0,0\n", "is not a table of t, roll, .*: line 2 is '1,0,0,east,0,0,0'"),
+    (
+        "t,roll,pitch,course,x,y,z\n0,0,0,0,0,0,0\n",
+        r"unknown column 'course' .*: allowed are t \[s, ms, us\], roll, pitch, yaw \[deg, rad\]",
+    ),
+    ("t,roll,pitch,x,y,z\n0,0,0,0,0,0\n", "columns t, roll, pitch, x, y, z: it must have yaw, and each of"),
+    ("#TIME_COLUMN: first\n0,0,0,0,0,0,0\n", "TIME_COLUMN = 'first' must be an integer"),
+    ("0,0,0,0,0,0,0\n", "number of records of 1: it must be at least 2"),
+    ("", "has no rows of numbers"),
+    ("t,roll_grad,pitch,yaw,x,y,z\n0,0,0,0,0,0,0\n", r"unknown unit in column 'roll_grad' .*\[deg, rad\]"),
 )
-def test_invalid_text(tmp_path, text, message):
+def test_invalid_text(text, tmp_path):
     path = tmp_path / "flight.csv"
     path.write_text(text)
-    with pytest.raises(UserError, match=message):
-        read_text_records(path)
+    read_text_records(path)
 
 
-@each_row(("given", "message"), [({"kind": "csv", "file": "none.csv"}, "cannot read .*none.csv")])
-def test_invalid_tables(tmp_path, given, message):
+@refuses(({"kind": "csv", "file": "none.csv"}, "cannot read .*none.csv"))
+def test_invalid_tables(given, tmp_path):
     _write(tmp_path / "flight.trj", [], NAMES)
-    with pytest.raises(UserError, match=message):
-        platform_of(given).trajectory(tmp_path)
+    platform_of(given).trajectory(tmp_path)
 
 
 def _sbet(path, longitude_deg, latitude_deg, heading_deg=0.0, wander_deg=0.0):
@@ -117,8 +108,8 @@ def test_sbet_positions_and_attitudes(tmp_path):
     assert trajectory.rotation_spec == "aerospace"
 
 
-@each_row(("epsg", "north"), [(32633, 60.0), (3006, 60.0), (3035, 60.0), (3413, 70.0), (2180, 60.0), (32661, 84.0)])
-def test_sbet_headings_are_those_of_the_grid(tmp_path, epsg, north):
+@each_row((32633, 60.0), (3006, 60.0), (3035, 60.0), (3413, 70.0), (2180, 60.0), (32661, 84.0))
+def test_sbet_headings_are_those_of_the_grid(epsg, north, tmp_path):
     """A metre along a geodesic with the true heading goes along the heading of the grid."""
     longitude, latitude, heading = (
         np.array([14.0, 17.0, 19.5]),
@@ -157,46 +148,33 @@ def test_truncated_sbet(tmp_path):
         read_sbet_records(tmp_path / "flight.sbet", 32633)
 
 
-@pytest.mark.parametrize(
-    ("row", "column", "value", "message"),
-    [
-        (1, 0, 0.0, "record 2: time = 0.0 s must be later than that of the record before, 345600.0 s"),
-        (2, 8, np.nan, "record 3: pitch = nan must be a number from -1e\\+12 to 1e\\+12"),
-        (1, 1, 60.0, "record 2: latitude = 60 and longitude = 0.261799 must be radians"),
-    ],
+@refuses(
+    (1, 0, 0.0, "record 2: time = 0.0 s must be later than that of the record before, 345600.0 s"),
+    (2, 8, np.nan, "record 3: pitch = nan must be a number from -1e\\+12 to 1e\\+12"),
+    (1, 1, 60.0, "record 2: latitude = 60 and longitude = 0.261799 must be radians"),
 )
-def test_invalid_sbet(tmp_path, row, column, value, message):
+def test_invalid_sbet(row, column, value, tmp_path):
     data = _sbet(tmp_path / "flight.sbet", np.full(3, 15.0), np.full(3, 60.0))
     data[row, column] = value
     data.tofile(tmp_path / "flight.sbet")
-    with pytest.raises(UserError, match=message):
-        read_sbet_records(tmp_path / "flight.sbet", 32633)
+    read_sbet_records(tmp_path / "flight.sbet", 32633)
 
 
-@each_row(
-    ("epsg", "message"),
-    [
-        (999999, "epsg = 999999 is no coordinate system that pyproj knows"),
-        (4326, r"epsg = 4326 \(WGS 84\) must be projected coordinates in metres, east and north"),
-        (2263, "epsg = 2263 .* must be projected coordinates in metres"),
-        (2053, "epsg = 2053 .* must be projected coordinates in metres, east and north"),
-    ],
+@refuses(
+    (999999, "epsg = 999999 is no coordinate system that pyproj knows"),
+    (4326, r"epsg = 4326 \(WGS 84\) must be projected coordinates in metres, east and north"),
+    (2263, "epsg = 2263 .* must be projected coordinates in metres"),
+    (2053, "epsg = 2053 .* must be projected coordinates in metres, east and north"),
 )
-def test_invalid_coordinate_systems(tmp_path, epsg, message):
+def test_invalid_coordinate_systems(epsg, tmp_path):
     _sbet(tmp_path / "flight.sbet", np.full(3, 15.0), np.full(3, 60.0))
-    with pytest.raises(UserError, match=message):
-        read_sbet_records(tmp_path / "flight.sbet", epsg)
+    read_sbet_records(tmp_path / "flight.sbet", epsg)
 
 
-@pytest.mark.parametrize(
-    ("longitude", "latitude", "epsg", "scale"),
-    # Spherical Mercator, 1 / cos(60 deg) but for the ellipsoid; the antipode of Lambert's projection.
-    [(15.0, 60.0, 3857, "2"), (-170.0, -52.0, 3035, "nan")],
-)
-def test_sbet_where_the_projection_has_another_scale(tmp_path, longitude, latitude, epsg, scale):
+@each_case((15.0, 60.0, 3857, "2"), (-170.0, -52.0, 3035, "nan"))
+def test_sbet_where_the_projection_has_another_scale(longitude, latitude, epsg, scale, tmp_path):
     _sbet(tmp_path / "flight.sbet", np.full(3, longitude), np.full(3, latitude))
     message = (
         rf"record 1: latitude = {latitude:g} and longitude = {longitude:g} deg must .*; its scale there is {scale}"
     )
-    with pytest.raises(UserError, match=message):
-        read_sbet_records(tmp_path / "flight.sbet", epsg)
+    must_refuse(message, read_sbet_records, tmp_path / "flight.sbet", epsg)

@@ -1,9 +1,14 @@
-"""Shipped scenes."""
+"""The catalogue of scenes: names, copies, and what the shipped ones hold."""
 
+import mitsuba as mi
 import pytest
+import references
+from rows import each_row, must_refuse, refuses
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.parameters.catalogue import unit_of
 from mitransient_lidar.loading import catalogue
+from mitransient_lidar.loading.document import read_document
 
 SCENE = """<!-- Flat bottom at 8 m, wind 3 m/s.
      The second line. -->
@@ -43,17 +48,13 @@ def test_path_of_name_and_of_file(folder, tmp_path):
     assert catalogue.scene_path(own) == own
 
 
-@pytest.mark.parametrize(
-    ("name", "sentence"),
-    [
-        ("fig9", "scene 'fig9' is neither a file nor a shipped scene; did you mean fig09"),
-        ("scenes/fig10.XML", "did you mean fig10"),
-        ("zzz", "scene 'zzz' .*; shipped scenes are fig09, fig10"),
-    ],
+@refuses(
+    ("fig9", "scene 'fig9' is neither a file nor a shipped scene; did you mean fig09"),
+    ("scenes/fig10.XML", "did you mean fig10"),
+    ("zzz", "scene 'zzz' .*; shipped scenes are fig09, fig10"),
 )
-def test_unknown_scene(folder, name, sentence):
-    with pytest.raises(UserError, match=sentence):
-        catalogue.scene_path(name)
+def test_unknown_scene(name, folder):
+    catalogue.scene_path(name)
 
 
 def test_first_default_wins_as_in_mitsuba(folder):
@@ -83,8 +84,7 @@ def test_files_of_the_guides_are_copied_with_the_data_that_they_name(tmp_path):
 
 def test_copy_overwrites_nothing(folder, tmp_path):
     (tmp_path / "target.ply").write_text("mine")
-    with pytest.raises(UserError, match=r"target\.ply exists already"):
-        catalogue.copy_scene("fig09", tmp_path)
+    must_refuse(r"target\.ply exists already", catalogue.copy_scene, "fig09", tmp_path)
     assert (tmp_path / "target.ply").read_text() == "mine"
     assert not (tmp_path / "fig09.xml").exists()
 
@@ -101,3 +101,34 @@ def test_figure_10_zooms_into_the_record_of_figure_11(number):
     zoom, whole = (catalogue.scene_parameters(catalogue.scene_path(f"fig{figure}_shot{number}")) for figure in (10, 11))
     assert {name for name in zoom if zoom[name] != whole[name]} <= {"time_start_ns", "bin_width_ns", "bin_count"}
     assert zoom.keys() == whole.keys()
+
+
+SHIPPED = references.read(references.SCENES)
+
+
+def test_parameters_are_those_of_the_reference():
+    """Those of table1, and what every other scene has otherwise or lacks."""
+    assert references.scene_parameters() == SHIPPED
+
+
+@each_row(*zip(SHIPPED))
+def test_text_equals_the_file_with_its_includes(name):
+    """Mitsuba reads the same plugins with the same parameters in the same order from both."""
+    config = mi.parser.ParserConfig(mi.variant())
+    text = catalogue.scene_text(name)
+    states = (mi.parser.parse_file(config, str(catalogue.scene_path(name))), mi.parser.parse_string(config, text))
+    file, flat = ([(str(node.type), str(node.props)) for node in state.nodes] for state in states)
+    assert len(flat) >= 8
+    assert flat == file
+    assert "<include" not in text
+    assert text.count("<scene") == text.count("</scene>") == 1
+    assert text.count("<default") == len(read_document(catalogue.scene_path(name)).parameters)
+
+
+def test_all_parameters_but_texts_have_a_unit():
+    own = {name for scene in SHIPPED for name in read_document(catalogue.scene_path(scene)).parameters}
+    assert {name for name in own if unit_of(name) is None} == {"layout"}
+    given = {"bottom_depth": "m", "surface_time": "s", "sea.slope_x_deg": "degree", "gate_width_ns": "ns"}
+    given |= {"plume_width": "m", "sphere_reflectance": "1", "kd": "1/m"}
+    assert {name: unit_of(name) for name in given} == given
+    assert unit_of("my_parameter") is None

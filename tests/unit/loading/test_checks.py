@@ -7,7 +7,7 @@ import os
 import mitsuba as mi
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse, refuses
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
@@ -25,11 +25,10 @@ def scene_file(folder, old, new):
     return path
 
 
-@each_row("value", [PATH, "/elsewhere/evil", "evil.so", "", "evil\n"])
-def test_types_that_are_paths_are_refused(tmp_path, value):
+@each_row(PATH, "/elsewhere/evil", "evil.so", "", "evil\n")
+def test_types_that_are_paths_are_refused(value, tmp_path):
     written = scene_file(tmp_path, '<integrator type="lidar_merging"/>', f'<integrator type="{value}"/>')
-    with pytest.raises(UserError, match="must be the name of a plugin"):
-        open_scene(written)
+    must_refuse("must be the name of a plugin", open_scene, written)
     with pytest.raises(UserError, match="must be the name of a plugin"):
         open_scene({"sea": {"type": "ocean_surface", "interior": {"type": value}}})
 
@@ -42,23 +41,19 @@ def test_folders_of_a_scene_are_not_kept_for_others(tmp_path):
     assert [str(path) for path in mi.file_resolver()] == before
 
 
-@each_row(
-    ("attributes", "message"),
-    [
-        ({"scene_xml": 3}, "the attribute scene_xml = 3 of the result is damaged: it must be a text"),
-        ({"scene_xml": "<scene/>", "scene.depth": [1, 2]}, r"scene.depth = \[1, 2\] of the result is damaged"),
-        ({"scene_xml": "<scene/>", "scene_files": "[3]"}, "scene_files of the result is damaged"),
-        ({"scene_xml": "<scene/>", "scene_files": "{"}, "scene_files of the result is damaged"),
-        ({"scene_xml": "<scene>"}, "is not well-formed XML"),
-        ({"scene_dict": "[" * 10**5}, "the scene of the result is nested more than 100 deep"),
-        ({"scene_dict": "[1]"}, "its text must be JSON of a scene"),
-        ({"scene_dict": '{"to_world": {"matrix": 3, "inverse_transpose": []}}'}, "its text must be JSON of a scene"),
-        ({}, "does not hold its scene"),
-    ],
+@refuses(
+    ({"scene_xml": 3}, "the attribute scene_xml = 3 of the result is damaged: it must be a text"),
+    ({"scene_xml": "<scene/>", "scene.depth": [1, 2]}, r"scene.depth = \[1, 2\] of the result is damaged"),
+    ({"scene_xml": "<scene/>", "scene_files": "[3]"}, "scene_files of the result is damaged"),
+    ({"scene_xml": "<scene/>", "scene_files": "{"}, "scene_files of the result is damaged"),
+    ({"scene_xml": "<scene>"}, "is not well-formed XML"),
+    ({"scene_dict": "[" * 10**5}, "the scene of the result is nested more than 100 deep"),
+    ({"scene_dict": "[1]"}, "its text must be JSON of a scene"),
+    ({"scene_dict": '{"to_world": {"matrix": 3, "inverse_transpose": []}}'}, "its text must be JSON of a scene"),
+    ({}, "does not hold its scene"),
 )
-def test_damaged_records_are_refused(attributes, message):
-    with pytest.raises(UserError, match=message):
-        open_scene(SceneSource.from_attributes(attributes))
+def test_damaged_records_are_refused(attributes):
+    open_scene(SceneSource.from_attributes(attributes))
 
 
 def stranger(folder, name, text):
@@ -98,16 +93,14 @@ def test_a_part_that_is_an_include_is_refused(tmp_path):
 
 @pytest.mark.parametrize("root", ['<shape version="3.0.0" type="../evil"/>', '<scene version="3.0.0" type="../evil"/>'])
 def test_the_type_of_the_root_is_checked(tmp_path, root):
-    with pytest.raises(UserError, match=r"has a root element .*: it must be <scene>"):
-        open_scene(stranger(tmp_path, "a.xml", root))
+    must_refuse(r"has a root element .*: it must be <scene>", open_scene, stranger(tmp_path, "a.xml", root))
 
 
 def test_a_path_within_another_path_is_refused(tmp_path):
     """Mitsuba looks for a folder in those before, too: libraries of a/b would have been loaded."""
     stranger(tmp_path / "a" / "b", "x", "")
     text = '<scene version="3.0.0"><path value="a"/><path value="b"/><shape type="evil"/></scene>'
-    with pytest.raises(UserError, match="path = 'b' is no folder in"):
-        open_scene(stranger(tmp_path, "a.xml", text))
+    must_refuse("path = 'b' is no folder in", open_scene, stranger(tmp_path, "a.xml", text))
 
 
 def test_libraries_in_resources_of_a_dict_or_the_current_folder_are_refused(tmp_path, monkeypatch):
@@ -117,24 +110,20 @@ def test_libraries_in_resources_of_a_dict_or_the_current_folder_are_refused(tmp_
     scene = {"type": "scene", "folder": {"type": "resources", "path": str(tmp_path)}, "shape": {"type": "evil"}}
     record = SceneSource.from_attributes({"scene_dict": json.dumps(scene)})
     for one in (scene, record):
-        with pytest.raises(UserError, match=r"evil.so would run as a plugin of Mitsuba"):
-            open_scene(one)
+        must_refuse(r"evil.so would run as a plugin of Mitsuba", open_scene, one)
     with pytest.raises(UserError, match="path = 'nowhere' of resources must be a folder"):
         open_scene({**scene, "folder": {"type": "resources", "path": "nowhere"}})
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=r"evil.so would run as a plugin of Mitsuba"):
-        open_scene({"type": "scene", "shape": {"type": "evil"}})
+    must_refuse(r"evil.so would run as a plugin of Mitsuba", open_scene, {"type": "scene", "shape": {"type": "evil"}})
 
 
-@each_row("plugin", ["blender", "serialized", "irregular", "polarizer", "homogeneous", "point"])
+@each_row("blender", "serialized", "irregular", "polarizer", "homogeneous", "point")
 def test_plugins_that_a_lidar_scene_cannot_have_are_refused(plugin, tmp_path):
-    """A polariser was left out as if it had no effect."""
     with pytest.raises(UserError, match=f"type = '{plugin}' is not loaded"):
         open_scene({"type": "scene", "shape": {"type": plugin, "filename": "a"}})
     path = tmp_path / "scene.xml"
     path.write_text(f'<scene version="3.0.0"><shape type="{plugin}"/></scene>')
-    with pytest.raises(UserError, match=f"type = '{plugin}' is not loaded"):
-        open_scene(path)
+    must_refuse(f"type = '{plugin}' is not loaded", open_scene, path)
 
 
 @pytest.mark.parametrize("given", ['value="400:0.1, 700:0.3"', 'filename="a.spd"'])
@@ -145,8 +134,7 @@ def test_spectra_by_wavelength_are_refused(given, tmp_path):
         '<scene version="3.0.0"><shape type="sphere"><bsdf type="diffuse">'
         f'<spectrum name="reflectance" {given}/></bsdf></shape></scene>'
     )
-    with pytest.raises(UserError, match="must be one number, the value at the laser's wavelength"):
-        open_scene(path)
+    must_refuse("must be one number, the value at the laser's wavelength", open_scene, path)
     name, _, value = given.replace('"', "").partition("=")
     value = [(400.0, 0.1), (700.0, 0.3)] if name == "value" else value
     reflectance = {"type": "spectrum", name: value}
@@ -162,7 +150,7 @@ def test_a_dict_with_tensors_is_loaded_twice():
         assert open_scene(scene).scene.shapes()
 
 
-@each_row("name", ["../../elsewhere/important", "/tmp/a", "a/b", "", "..", "a\nb", "\x1b[2J", "x" * 300, 3])
+@each_row("../../elsewhere/important", "/tmp/a", "a/b", "", "..", "a\nb", "\x1b[2J", "x" * 300, 3)
 def test_the_name_of_the_scene_of_a_result_is_that_of_a_file(name):
     """Files of the result's repetition begin with it: a path led out of the folder of ``-o``."""
     with pytest.raises(UserError, match=r"the attribute scene = .* of the result is damaged") as caught:
@@ -185,12 +173,10 @@ def test_a_pipe_that_mitsuba_would_read_is_refused(tmp_path, monkeypatch):
     for folder, part in itertools.product(("", "other", "here"), parts):
         text = f'<scene version="3.0.0"><path value="other"/>{part.format(f"pipe{folder}")}</scene>'
         (tmp_path / "a.xml").write_text(text)
-        with pytest.raises(UserError, match=f"pipe{folder}: it is a named pipe"):
-            open_scene(tmp_path / "a.xml")
+        must_refuse(f"pipe{folder}: it is a named pipe", open_scene, tmp_path / "a.xml")
     given = {"type": "scene", "mesh": {"type": "ply", "filename": "pipehere"}}
     for one in (given, SceneSource.from_attributes({"scene_dict": json.dumps(given)})):
-        with pytest.raises(UserError, match="pipehere: it is a named pipe"):
-            open_scene(one)
+        must_refuse("pipehere: it is a named pipe", open_scene, one)
     with pytest.raises(UserError, match="pipehere: it is a named pipe"):
         choose_integrator(open_scene({"type": "scene"}).scene, {**given, "type": "lidar_merging"})
 
@@ -214,8 +200,7 @@ def test_names_of_files_are_texts_and_types_are_checked_with_parameters_in_place
 def test_integrators_of_a_command_are_names():
     scene = open_scene("table1").scene
     for wanted in (PATH, {"type": PATH}, {"type": "lidar_volpath", "nested": {"type": PATH}}):
-        with pytest.raises(UserError, match=NOT_A_NAME):
-            choose_integrator(scene, wanted)
+        must_refuse(NOT_A_NAME, choose_integrator, scene, wanted)
 
 
 @pytest.mark.parametrize("place", ["beside the scene", "named by the scene"])
@@ -230,5 +215,4 @@ def test_libraries_of_plugins_beside_a_scene_are_refused(tmp_path, place, librar
         written = scene_file(tmp_path / "scene", "", "")
     open_scene(written)
     (folder / "plugins" / library).write_bytes(b"")
-    with pytest.raises(UserError, match=rf"{library} would run as a plugin of Mitsuba; remove it"):
-        open_scene(written)
+    must_refuse(rf"{library} would run as a plugin of Mitsuba; remove it", open_scene, written)

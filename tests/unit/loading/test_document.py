@@ -1,12 +1,17 @@
-"""Scene files that include others."""
+"""Scenes as documents: includes, parameters, and scenes of Python in JSON."""
+
+import json
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_case, each_row, must_refuse
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue, scenes
 from mitransient_lidar.loading.document import read_document
+from mitransient_lidar.loading.scene_source import SceneSource
+from mitransient_lidar.loading.scenes import open_scene
 
 SCENE = """<?xml version="1.0" encoding="utf-8"?>
 <!-- A level sea -->
@@ -146,21 +151,17 @@ def test_part_beside_the_including_file_is_found(scene):
     assert read_document(scene).text == FLAT
 
 
-@pytest.mark.parametrize(
-    ("part", "text", "sentence"),
-    [
-        ("own.xml", '<scene><include filename="gone.xml"/></scene>', r"own\.xml includes 'gone\.xml', which is not"),
-        ("own.xml", "<scene><include/></scene>", "own.xml includes '', which is not found"),
-        ("parts/matt.xml", '<bsdf><include filename="ball.xml"/>', r"scene .*matt\.xml is not well-formed XML"),
-        ("parts/point.xml", '<scene><include filename="ball.xml"/></scene>', r"includes 'ball\.xml', which includes"),
-        ("parts/point.xml", b"\xff\xfe\x00", r"point\.xml is not a text file in UTF-8"),
-    ],
+@each_case(
+    ("own.xml", '<scene><include filename="gone.xml"/></scene>', r"own\.xml includes 'gone\.xml', which is not"),
+    ("own.xml", "<scene><include/></scene>", "own.xml includes '', which is not found"),
+    ("parts/matt.xml", '<bsdf><include filename="ball.xml"/>', r"scene .*matt\.xml is not well-formed XML"),
+    ("parts/point.xml", '<scene><include filename="ball.xml"/></scene>', r"includes 'ball\.xml', which includes"),
+    ("parts/point.xml", b"\xff\xfe\x00", r"point\.xml is not a text file in UTF-8"),
 )
-def test_wrong_includes(scene, part, text, sentence):
+def test_wrong_includes(part, text, sentence, scene):
     (scene.parent / part).write_bytes(text if isinstance(text, bytes) else text.encode())
     for use in (read_document, catalogue.scene_parameters, catalogue.copy_scene, scenes.open_scene):
-        with pytest.raises(UserError, match=sentence):
-            use(scene)
+        must_refuse(sentence, use, scene)
 
 
 def test_includes_that_double_are_refused_at_once(tmp_path):
@@ -170,8 +171,7 @@ def test_includes_that_double_are_refused_at_once(tmp_path):
         (tmp_path / f"{number}.xml").write_text(f'<scene version="3.0.0">{part}{part}</scene>')
     (tmp_path / "27.xml").write_text('<scene version="3.0.0"/>')
     for use in (read_document, catalogue.scene_parameters, scenes.open_scene):
-        with pytest.raises(UserError, match=r"scene .*0\.xml includes more than 256 files, which is the limit"):
-            use(tmp_path / "0.xml")
+        must_refuse(r"scene .*0\.xml includes more than 256 files, which is the limit", use, tmp_path / "0.xml")
 
 
 def test_parameters_that_double_are_refused_at_once(tmp_path):
@@ -179,8 +179,7 @@ def test_parameters_that_double_are_refused_at_once(tmp_path):
     parameters = [f'<default name="p{n:02}" value="$p{n + 1:02},$p{n + 1:02}"/>' for n in range(40)]
     shape = '<default name="p40" value="1"/><shape type="sphere"><float name="radius" value="$p00"/></shape>'
     (tmp_path / "bomb.xml").write_text(f'<scene version="3.0.0">{"".join(parameters)}{shape}</scene>')
-    with pytest.raises(UserError, match=r"p00 = .* has more than a million characters"):
-        scenes.open_scene(tmp_path / "bomb.xml")
+    must_refuse(r"p00 = .* has more than a million characters", scenes.open_scene, tmp_path / "bomb.xml")
 
 
 @pytest.mark.parametrize("folder", ["maps", "$x"])
@@ -201,8 +200,7 @@ def test_dollar_signs_in_values_are_taken_as_they_are(tmp_path, monkeypatch, fol
             assert again.scene.bbox().max.z == pytest.approx(-6)
             assert again.source.parameters["file"] == given
     own.write_text(text.replace('value="$depth"', 'value="$dept"'))
-    with pytest.raises(UserError, match=r"depth = '\$dept' refers to an unknown parameter of the scene"):
-        scenes.open_scene(own)
+    must_refuse(r"depth = '\$dept' refers to an unknown parameter of the scene", scenes.open_scene, own)
 
 
 def test_folders_of_a_scene_are_those_beside_it(tmp_path, monkeypatch):
@@ -211,3 +209,51 @@ def test_folders_of_a_scene_are_those_beside_it(tmp_path, monkeypatch):
     (tmp_path / "scene" / "own.xml").write_text('<scene version="3.0.0"><path value="a"/></scene>')
     monkeypatch.chdir(tmp_path / "here")
     assert read_document(tmp_path / "scene" / "own.xml").folders[0] == (tmp_path / "scene" / "a").resolve()
+
+
+NUMBERS = np.random.default_rng(1).random((4, 4, 4, 1), np.float32)
+COLOURS = np.uint8(255 * NUMBERS[..., 0].reshape(8, 2, 4)[..., :3])
+BOX = mi.ScalarTransform4f().translate([0, 0, -5])
+
+
+def volume(**given):
+    return {"type": "volume", "volume": {"type": "gridvolume", "raw": True, **given}}
+
+
+@each_row(
+    {"type": "bitmap", "bitmap": mi.Bitmap(NUMBERS[0]), "raw": True},
+    {"type": "bitmap", "bitmap": mi.Bitmap(NUMBERS[0]).convert(component_format=mi.Struct.Type.Float16)},
+    {"type": "bitmap", "bitmap": mi.Bitmap(COLOURS), "wrap_mode": "mirror"},
+    {"type": "bitmap", "data": mi.TensorXf(NUMBERS[0]), "raw": True},
+    {"type": "checkerboard", "color0": 0.2, "color1": {"type": "bitmap", "bitmap": mi.Bitmap(COLOURS)}},
+    volume(grid=mi.VolumeGrid(NUMBERS), to_world=mi.ScalarTransform4f().scale(2)),
+    volume(data=mi.TensorXf(NUMBERS)),
+)
+def test_textures_of_python_are_restored(texture):
+    solid = {"type": "cube", "to_world": BOX, "bsdf": {"type": "diffuse", "reflectance": texture}}
+    loaded = open_scene({"solid": solid})
+    again = open_scene(SceneSource.from_attributes(loaded.source.attributes()))
+    values = [dict(mi.traverse(one.scene)) for one in (loaded, again)]
+    assert list(values[0]) == list(values[1])
+    for name, value in values[0].items():
+        np.testing.assert_array_equal(np.array(value), np.array(values[1][name]), err_msg=name)
+
+
+def test_a_grid_of_distances_is_restored():
+    grid = {"type": "sdfgrid", "grid": mi.TensorXf(NUMBERS - 0.5), "to_world": BOX}
+    loaded = open_scene({"solid": grid})
+    again = open_scene(SceneSource.from_attributes(loaded.source.attributes()))
+    found = [np.array(mi.traverse(one.scene)["solid.grid"]) for one in (loaded, again)]
+    np.testing.assert_array_equal(*found)
+
+
+def test_large_images_and_damaged_ones_are_refused():
+    noise = np.random.default_rng(1).random((600, 600, 1), np.float32)
+    scene = {"type": "bitmap", "bitmap": mi.Bitmap(noise), "raw": True}
+    assert SceneSource.of_dict({"image": scene}) is None
+    scene["bitmap"] = mi.Bitmap(NUMBERS[0])
+    stored = json.loads(SceneSource.of_dict({"image": scene}).text)
+    for damage in ({"data": "AAAA"}, {"shape": [5, 5, 1]}, {"dtype": "O"}, {"pixel_format": "None"}, {"data": "*"}):
+        text = json.dumps({"image": {**scene, "bitmap": {**stored["image"]["bitmap"], **damage}}})
+        with pytest.raises(UserError, match="the scene of the result is damaged"):
+            open_scene(SceneSource.from_attributes({"scene_dict": text}))

@@ -62,14 +62,11 @@ def test_functions_call_each_other_and_raise():
 
 
 @pytest.mark.parametrize("defers", [False, True])
-def test_an_interruption_ends_the_waiting(busy, defers):
-    # Where a shell began the tests in the background, it has told them to ignore the signal.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+def test_an_interruption_ends_the_waiting(busy, default_ctrl_c, defers):
     timer = threading.Timer(0.3, os.kill, [os.getpid(), signal.SIGINT])
     timer.start()
     with pytest.raises(KeyboardInterrupt), DeferredInterrupt(at_once=defers):
         turn()
-    signal.signal(signal.SIGINT, before)
     timer.join()
     busy.set()
     turn()

@@ -5,7 +5,7 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse, refuses
 
 from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.core.errors import UserError
@@ -38,18 +38,16 @@ SEA = """<scene version="3.0.0">
 
 
 def parts(loaded):
-    """Return transmitter and receiver of a scene."""
     transmitter = next(each for each in loaded.emitters() if hasattr(each, "pulse"))
     (sensor,) = loaded.sensors()
     return transmitter, sensor.receiver
 
 
 def values(name):
-    """Return the values of an instrument by their names, without empty ones."""
     return {each.name: each.value for each in catalogue.read_instrument(name).parameters if each.value}
 
 
-@each_row("name", NAMES)
+@each_row(*zip(NAMES))
 def test_every_value_that_is_needed_has_a_source_or_is_assumed(name):
     instrument, given = catalogue.read_instrument(name), values(name)
     assert given.keys() >= NEEDED
@@ -68,7 +66,7 @@ def test_every_value_that_is_needed_has_a_source_or_is_assumed(name):
     assert cited == listed
 
 
-@each_row("name", NAMES)
+@each_row(*zip(NAMES))
 def test_the_loaded_lidar_has_the_values_of_the_file(name):
     given = {key: float(value) for key, value in values(name).items() if key != "layout"}
     transmitter, receiver = parts(scenes.open_scene("table1", FLAT, name).scene)
@@ -143,35 +141,26 @@ def test_files_of_the_scene_are_found_with_an_instrument(tmp_path, monkeypatch):
     assert "rock" in [shape.id() for shape in loaded.shapes()]
 
 
-@pytest.mark.parametrize(
-    ("name", "sentence"),
-    [
-        ("riegl_vq840", "instrument = 'riegl_vq840' is not known; did you mean riegl_vq840g"),
-        ("own.xml", "instrument = 'own.xml' is not known; a lidar of a file is a part of a scene, by <include>"),
-        ("zzz", "instrument = 'zzz' is not known; instruments are icesat2_atlas, .*, usgs_eaarl_b"),
-        (5, "instrument = 5 is not known"),
-        ("../instruments/riegl_vq840g", "is not known"),
-    ],
+@each_row(
+    ("riegl_vq840", "instrument = 'riegl_vq840' is not known; did you mean riegl_vq840g"),
+    ("own.xml", "instrument = 'own.xml' is not known; a lidar of a file is a part of a scene, by <include>"),
+    ("zzz", "instrument = 'zzz' is not known; instruments are icesat2_atlas, .*, usgs_eaarl_b"),
+    (5, "instrument = 5 is not known"),
+    ("../instruments/riegl_vq840g", "is not known"),
 )
 def test_unknown_instruments_are_refused(name, sentence):
     for call in (catalogue.read_instrument, catalogue.instrument_text):
-        with pytest.raises(UserError, match=sentence):
-            call(name)
-    with pytest.raises(UserError, match=sentence):
-        scenes.open_scene("table1", None, name)
+        must_refuse(sentence, call, name)
+    must_refuse(sentence, scenes.open_scene, "table1", None, name)
 
 
-@each_row(
-    ("scene", "params", "sentence"),
-    [
-        ("table1", {"layout": "1x1"}, "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil"),
-        ({"type": "scene"}, None, "instrument = 'teledyne_czmil' needs an XML scene, not a dict"),
-        ("loaded", None, "not a loaded scene"),
-    ],
+@refuses(
+    ("table1", {"layout": "1x1"}, "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil"),
+    ({"type": "scene"}, None, "instrument = 'teledyne_czmil' needs an XML scene, not a dict"),
+    ("loaded", None, "not a loaded scene"),
 )
-def test_what_an_instrument_does_not_fit_is_refused(scene, params, sentence):
-    with pytest.raises(UserError, match=sentence):
-        scenes.open_scene(mi.load_dict({"type": "scene"}) if scene == "loaded" else scene, params, "teledyne_czmil")
+def test_what_an_instrument_does_not_fit_is_refused(scene, params):
+    scenes.open_scene(mi.load_dict({"type": "scene"}) if scene == "loaded" else scene, params, "teledyne_czmil")
 
 
 def test_parameters_of_an_infrared_channel():

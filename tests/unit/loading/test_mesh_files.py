@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from array_inputs import mesh
+from rows import each_case, must_refuse
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.checks import check_ply
@@ -36,11 +37,9 @@ def with_index(path, index):
 
 @pytest.mark.parametrize("index", [4, 2_000_000_000, -5, 2**31 - 1])
 def test_faces_without_a_vertex_are_refused(square, index):
-    """2 000 000 000 ended the process by a signal, -5 was read from other places of the memory."""
     with_index(square, index)
     scene = {"type": "scene", "mesh": {"type": "ply", "filename": str(square)}}
-    with pytest.raises(UserError, match=f"has a face with the vertex {index}, and the vertices 0 to 3 alone"):
-        open_scene(scene)
+    must_refuse(f"has a face with the vertex {index}, and the vertices 0 to 3 alone", open_scene, scene)
 
 
 def test_the_mesh_of_a_result_is_checked(square):
@@ -51,34 +50,28 @@ def test_the_mesh_of_a_result_is_checked(square):
     digest = hashlib.sha256(square.read_bytes()).hexdigest()
     rows = [{"plugin": "ply", "name": str(square), "path": str(square), "sha256": digest}]
     changed = {**record.attributes(), "scene_files": json.dumps(rows)}
-    with pytest.raises(UserError, match="has a face with the vertex 4"):
-        open_scene(SceneSource.from_attributes(changed))
+    must_refuse("has a face with the vertex 4", lambda: open_scene(SceneSource.from_attributes(changed)))
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        (b"element vertex 4", b"element vertex 5"),
-        (b"element vertex 4", b"element vertex 4294967300"),
-        (b"element vertex 4", b"element vertex -1"),
-        (b"element face 2", b"element face 1000000000000"),
-        (b"element face 2", b"element face 3"),
-        (b"element face 2", b"element vertex 2"),
-        (b"element face 2", b"element nothing 99999999999999\nelement face 2"),
-        (b"property list uchar int vertex_indices", b"property list uchar none vertex_indices"),
-        (b"end_header", b"end_of_header"),
-        (b"ply\n", b"ply\ncomment " + b"x" * 5000 + b"\n"),
-        (b"element face 2", b"element \x1b]0;title\x07 0\nelement face 2"),
-    ],
+@each_case(
+    (b"element vertex 4", b"element vertex 5"),
+    (b"element vertex 4", b"element vertex 4294967300"),
+    (b"element vertex 4", b"element vertex -1"),
+    (b"element face 2", b"element face 1000000000000"),
+    (b"element face 2", b"element face 3"),
+    (b"element face 2", b"element vertex 2"),
+    (b"element face 2", b"element nothing 99999999999999\nelement face 2"),
+    (b"property list uchar int vertex_indices", b"property list uchar none vertex_indices"),
+    (b"end_header", b"end_of_header"),
+    (b"ply\n", b"ply\ncomment " + b"x" * 5000 + b"\n"),
+    (b"element face 2", b"element \x1b]0;title\x07 0\nelement face 2"),
 )
-def test_headers_that_lie_are_refused(square, old, new):
+def test_headers_that_lie_are_refused(old, new, square):
     change(square, old, new)
-    with pytest.raises(UserError, match=r"is damaged, or is not a PLY file of triangles|has a face with the vertex"):
-        check_ply(square)
+    must_refuse(r"is damaged, or is not a PLY file of triangles|has a face with the vertex", check_ply, square)
 
 
 def test_a_message_that_quotes_other_bytes_than_text_is_a_sentence(tmp_path):
-    """Python's binding cannot decode what Mitsuba says of the line, and raised UnicodeDecodeError."""
     path = mesh("a.obj")(tmp_path)
     path.write_bytes(path.read_bytes() + b"v 1 \xf6 2\n")
     with pytest.raises(UserError, match="could not parse line") as caught:
@@ -111,13 +104,11 @@ def test_checks_agree_with_what_mitsuba_reads(tmp_path, order):
     np.testing.assert_array_equal(found, faces["i"])
     faces["i"][-1, 2] = 1000
     write()
-    with pytest.raises(UserError, match="has a face with the vertex 1000"):
-        check_ply(path)
+    must_refuse("has a face with the vertex 1000", check_ply, path)
 
 
 @pytest.mark.parametrize("kind", ["gridvolume", "sdfgrid"])
 def test_grids_of_other_sizes_than_their_header_says_are_refused(tmp_path, kind):
-    """2^30 cells along each side overflowed to none, and were read from other places of the memory."""
     path = tmp_path / "grid.vol"
     mi.VolumeGrid(np.linspace(-0.5, 0.5, 24, dtype=np.float32).reshape(2, 3, 4, 1)).write(str(path))
     grid = {"type": kind, "filename": str(path)}
@@ -130,5 +121,4 @@ def test_grids_of_other_sizes_than_their_header_says_are_refused(tmp_path, kind)
         with pytest.raises(UserError, match=r"grid.vol has \d+ bytes, and says that it holds .* cells"):
             open_scene({"type": "scene", "part": held})
     path.write_bytes(b"VOL")
-    with pytest.raises(UserError, match=r"grid.vol is damaged, or is not a grid of Mitsuba"):
-        open_scene({"type": "scene", "part": held})
+    must_refuse(r"grid.vol is damaged, or is not a grid of Mitsuba", open_scene, {"type": "scene", "part": held})

@@ -165,12 +165,11 @@ RANGES = [
 
 
 @each_row(
-    ("function", "arguments", "name"),
-    [
+    *[
         pytest.param(function, {**valid, name: value}, name, id=f"{function.__qualname__} {name}")
         for function, valid, outside in RANGES
         for name, value in outside.items()
-    ],
+    ]
 )
 def test_numbers_outside_their_range_are_refused_by_name(function, arguments, name):
     given = np.asarray(arguments[name])

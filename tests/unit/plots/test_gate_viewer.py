@@ -9,6 +9,7 @@ import zlib
 import numpy as np
 import pytest
 import xarray as xr
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.gate_viewer.page import page_text
@@ -18,7 +19,6 @@ ROWS, COLUMNS, GATES, BINS = 30, 21, 40, 120
 
 @pytest.fixture(scope="module")
 def scene():
-    """Stack and render of random numbers."""
     rng = np.random.default_rng(5)
     angles = {
         "angle_x": (("row", "column"), np.repeat(np.linspace(3, -3, ROWS)[:, None], COLUMNS, 1)),
@@ -174,34 +174,28 @@ def test_large_pages_show_means(scene, tmp_path, caplog):
         assert [record.getMessage() for record in caplog.records] == [f"the page: {note}" for note in notes]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            lambda stack, result: (result[["waveform_stderr"]], "page.html"),
-            "the dataset is no gate stack: it has no variable gate_energy",
-        ),
-        (lambda stack, result: (result, "page.html"), "the dataset has no coordinate row"),
-        (
-            lambda stack, result: (result.isel(row=0).rename(column="pixel").drop_vars("angle_x"), "page.html"),
-            "the dataset has no coordinate pixel",
-        ),
-        (
-            lambda stack, result: (numbered(result).drop_vars(["angle_x", "angle_y"]), "page.html"),
-            "the result has no coordinate angle_x over (row, column): it has no map to draw",
-        ),
-        (
-            lambda stack, result: (numbered(result), "page.html", None, 0.01),
-            "limit_mb = 0.01 is too small for this stack",
-        ),
-        (lambda stack, result: (stack, "page.html", result[["waveform_stderr"]]), "has no variable waveform"),
-        (lambda stack, result: (stack, "page.html", result.isel(row=slice(3))), "must be those of the gate stack"),
-        (lambda stack, result: (stack.isel(row=0), "page.html"), "(row, column, gate) or (pixel, gate)"),
-        (lambda stack, result: (stack, "page.html", None, 0), "limit_mb = 0 must be greater than 0"),
-        (lambda stack, result: (stack, "page.html", None, 0.01), "limit_mb = 0.01 is too small for this stack"),
-    ],
+@each_row(
+    (
+        lambda stack, result: (result[["waveform_stderr"]], "page.html"),
+        "the dataset is no gate stack: it has no variable gate_energy",
+    ),
+    (lambda stack, result: (result, "page.html"), "the dataset has no coordinate row"),
+    (
+        lambda stack, result: (result.isel(row=0).rename(column="pixel").drop_vars("angle_x"), "page.html"),
+        "the dataset has no coordinate pixel",
+    ),
+    (
+        lambda stack, result: (numbered(result).drop_vars(["angle_x", "angle_y"]), "page.html"),
+        "the result has no coordinate angle_x over (row, column): it has no map to draw",
+    ),
+    (lambda stack, result: (numbered(result), "page.html", None, 0.01), "limit_mb = 0.01 is too small for this stack"),
+    (lambda stack, result: (stack, "page.html", result[["waveform_stderr"]]), "has no variable waveform"),
+    (lambda stack, result: (stack, "page.html", result.isel(row=slice(3))), "must be those of the gate stack"),
+    (lambda stack, result: (stack.isel(row=0), "page.html"), "(row, column, gate) or (pixel, gate)"),
+    (lambda stack, result: (stack, "page.html", None, 0), "limit_mb = 0 must be greater than 0"),
+    (lambda stack, result: (stack, "page.html", None, 0.01), "limit_mb = 0.01 is too small for this stack"),
 )
-def test_invalid_input_is_rejected_in_one_sentence(scene, tmp_path, change, message):
+def test_invalid_input_is_rejected_in_one_sentence(change, message, scene, tmp_path):
     stack, name, *rest = change(*(data.isel(row=slice(0, 4), column=slice(0, 4)) for data in scene))
     with pytest.raises(UserError, match=re.escape(message)) as caught:
         write_page(stack, tmp_path / name, *rest)

@@ -24,7 +24,6 @@ def on_sea(angle_x_mrad):
 
 
 def patches(figure):
-    """Return the filled shapes of the pixels."""
     return [patch for patch in figure.axes[0].patches if isinstance(patch, PathPatch)]
 
 

@@ -9,6 +9,7 @@ from colour_vision import ciede2000, closest, lab
 from figure_inputs import FIGURES
 from matplotlib.colors import to_hex
 from matplotlib.text import Text
+from rows import each_row
 
 from mitransient_lidar.plots import drawing, palette
 from mitransient_lidar.plots.studies import depths
@@ -25,31 +26,24 @@ UNITLESS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("first", "second", "expected"),
-    [  # of Sharma, Wu and Dalal 2005, table 1
-        ((50, 2.6772, -79.7751), (50, 0, -82.7485), 2.0425),
-        ((50, 2.5, 0), (73, 25, -18), 27.1492),
-        ((2.0776, 0.0795, -1.135), (0.9033, -0.0636, -0.5514), 0.9082),
-        ((22.7233, 20.0904, -46.694), (23.0331, 14.973, -42.5619), 2.0373),
-    ],
+@each_row(  # of Sharma, Wu and Dalal 2005, table 1
+    ((50, 2.6772, -79.7751), (50, 0, -82.7485), 2.0425),
+    ((50, 2.5, 0), (73, 25, -18), 27.1492),
+    ((2.0776, 0.0795, -1.135), (0.9033, -0.0636, -0.5514), 0.9082),
+    ((22.7233, 20.0904, -46.694), (23.0331, 14.973, -42.5619), 2.0373),
 )
 def test_differences_are_those_of_the_published_table(first, second, expected):
     assert ciede2000(first, second) == pytest.approx(expected, abs=6e-5)
 
 
-@pytest.mark.parametrize(
-    ("colours", "least"),
-    [
-        (palette.CATEGORIES, APART),
-        (palette.pixel_colours(4), APART),
-        ([*palette.CLASSES.values()], APART),
-        ([*palette.ORIGINS.values()], APART),
-        ((palette.BEAM, palette.VIEW, palette.SEA, palette.BOTTOM, palette.TARGET), APART),
-        (depths._ORDER_COLOURS, APART_IN_ORDER),
-        (palette.ordered(6), APART_IN_ORDER),
-    ],
-    ids=["categories", "pixels", "classes", "origins", "scene", "orders", "sequence"],
+@each_row(
+    (palette.CATEGORIES, APART),
+    (palette.pixel_colours(4), APART),
+    ([*palette.CLASSES.values()], APART),
+    ([*palette.ORIGINS.values()], APART),
+    ((palette.BEAM, palette.VIEW, palette.SEA, palette.BOTTOM, palette.TARGET), APART),
+    (depths._ORDER_COLOURS, APART_IN_ORDER),
+    (palette.ordered(6), APART_IN_ORDER),
 )
 def test_colours_are_told_apart(colours, least):
     found = closest(colours)
@@ -64,7 +58,6 @@ def test_red_and_green_of_equal_lightness_are_not_told_apart():
 
 
 def looks(line):
-    """Return colour, and line style and marker, of a line."""
     dashes = line._dash_pattern[1] if line.get_linestyle() != "None" else "no line"
     return to_hex(line.get_color()), (None if dashes is None else str(dashes), str(line.get_marker()))
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
+from rows import must_refuse
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.las import write_points
 from mitransient_lidar.plots import viewer
 from mitransient_lidar.plots.scene_viewer import page as traces
@@ -151,10 +151,8 @@ def test_points_of_a_file(tmp_path):
     assert array(data["bottom (2)"]["z"]) == pytest.approx([-4.0, -4.5], abs=1e-3)
     assert array(data["bottom (2)"]["customdata"]).ravel() == pytest.approx([10.0, np.nan], nan_ok=True)
     (tmp_path / "broken.las").write_bytes(b"LASF and no more")
-    with pytest.raises(UserError, match=r"broken.las is no LAS file, or damaged"):
-        viewer.view_points(tmp_path / "broken.las")
-    with pytest.raises(UserError, match=r"suffix must be .las or .laz"):
-        viewer.view_points(tmp_path / "points.csv")
+    must_refuse(r"broken.las is no LAS file, or damaged", viewer.view_points, tmp_path / "broken.las")
+    must_refuse(r"suffix must be .las or .laz", viewer.view_points, tmp_path / "points.csv")
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_case, must_refuse
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
@@ -21,11 +22,8 @@ def scene_with(lidar_scene, name, depth=8.0):
     return lidar_scene(integrator={"type": name, **INTEGRATORS[name]}, film=automatic, bottom=depth)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param("lidar_volpath", marks=pytest.mark.slow), pytest.param("lidar_merging", marks=pytest.mark.long)],
-)
-def test_an_edited_scene_is_laid_out_anew(lidar_scene, name):
+@each_case(pytest.param("lidar_volpath", marks=pytest.mark.slow), pytest.param("lidar_merging", marks=pytest.mark.long))
+def test_an_edited_scene_is_laid_out_anew(name, lidar_scene):
     """A bottom moved from 8 m to 30 m gives the record of a scene that was built with it at 30 m, in every bit."""
     scene = scene_with(lidar_scene, name)
     before = np.array(mi.render(scene, seed=1))
@@ -85,19 +83,16 @@ def test_seeds_and_numbers_of_paths_are_checked(lidar_scene):
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_gradients_are_refused(lidar_scene, name):
     scene = scene_with(lidar_scene, name)
-    with pytest.raises(UserError, match=f"{name} passes no gradients"):
-        scene.integrator().render_forward(scene, None)
+    must_refuse(f"{name} passes no gradients", lambda: scene.integrator().render_forward(scene, None))
     parameters = mi.traverse(scene)
     key = "bottom.bsdf.reflectance.value"
     dr.enable_grad(parameters[key])
     parameters.update()
     energy = dr.sum(mi.render(scene, parameters, seed=1), axis=None)
-    with pytest.raises(UserError, match=f"{name} passes no gradients"):
-        dr.backward(energy)
+    must_refuse(f"{name} passes no gradients", dr.backward, energy)
 
 
 def living():
-    """Return the number of prepared scenes in memory."""
     gc.collect()
     return sum(isinstance(one, LidarScene | DaylightScene) for one in gc.get_objects())
 

@@ -43,20 +43,17 @@ def test_a_reflected_pose_is_refused():
         mi.load_dict({"type": "multipixel_receiver", "to_world": look @ mi.ScalarTransform4f().scale([-1, 1, 1])})
 
 
-@pytest.mark.parametrize(
-    ("sensor", "solid_angle"),
-    [
-        # 0.8 rad across: the tangent-plane area alone would be 12 % and 15 % too large.
-        ({"type": "multipixel_receiver", "field_of_view_mrad": 800.0}, 2 * np.pi * (1 - 1 / np.hypot(1, 0.4))),
-        (
-            {"type": "multipixel_receiver", "field_of_view_mrad": 800.0, "field_of_view_shape": "square"},
-            4 * np.arcsin(0.4**2 / (1 + 0.4**2)),
-        ),
-        (
-            {"type": "pixel_fov", "shape": "ring", "field_of_view_mrad": 800.0, "inner_mrad": 400.0},
-            2 * np.pi * (1 / np.hypot(1, 0.2) - 1 / np.hypot(1, 0.4)),
-        ),
-    ],
+@each_row(
+    # 0.8 rad across: the tangent-plane area alone would be 12 % and 15 % too large.
+    ({"type": "multipixel_receiver", "field_of_view_mrad": 800.0}, 2 * np.pi * (1 - 1 / np.hypot(1, 0.4))),
+    (
+        {"type": "multipixel_receiver", "field_of_view_mrad": 800.0, "field_of_view_shape": "square"},
+        4 * np.arcsin(0.4**2 / (1 + 0.4**2)),
+    ),
+    (
+        {"type": "pixel_fov", "shape": "ring", "field_of_view_mrad": 800.0, "inner_mrad": 400.0},
+        2 * np.pi * (1 / np.hypot(1, 0.2) - 1 / np.hypot(1, 0.4)),
+    ),
 )
 def test_rays_for_mitsubas_integrators_carry_aperture_and_solid_angle(sensor, solid_angle):
     plugin = mi.load_dict(sensor)
@@ -68,7 +65,7 @@ def test_rays_for_mitsubas_integrators_carry_aperture_and_solid_angle(sensor, so
     np.testing.assert_allclose(np.linalg.norm(np.array(ray.d), axis=0), 1, atol=1e-6)
 
 
-@each_row("count", [4096, 5000])
+@each_row(4096, 5000)
 def test_stratified_points_cover_the_square_evenly(count):
     """In 16 x 16 cells 4096 points fall 16 into each, and of 5000 nearly as many: random ones would spread by 4."""
     points = np.array(stratified_point(dr.arange(mi.UInt32, count), count, pass_streams(1, 0, count)))
@@ -76,29 +73,6 @@ def test_stratified_points_cover_the_square_evenly(count):
     assert points.max() < 1
     counts = np.histogram2d(*points, bins=(16, 16), range=((0, 1), (0, 1)))[0]
     assert np.abs(counts - count / 256).max() < 2 if count == 5000 else counts.std() == 0
-
-
-@pytest.mark.slow
-def test_imager_rows_go_from_far_to_near_and_columns_from_left_to_right(lidar_scene, passes):
-    """A beam aimed 1.5 m towards +y, as seen 200 m away, lights the left columns, near rows first."""
-    scene = lidar_scene(
-        tx={"aim_y": 1.5},
-        rx={"layout": "4x6", "field_of_view_shape": "square"},
-        sea={"slope_variance": "0.02"},
-        water={"attenuation": 50.0, "scattering": 0.0, "backscattering": 0.0},
-        film={"bin_width_ns": 0.5, "bin_count": 120},
-        bottom=None,
-    )
-    energy = passes(scene, 4).mean(axis=0)
-    assert energy.shape == (4, 6, 120)
-    assert np.array(mi.render(scene)).shape == (4, 6, 120)
-    columns = energy.sum(axis=(0, 2))
-    # 1.5 m at a range of 212.8 m are 7 mrad: in the second of the six columns of 5 mrad.
-    assert np.argmax(columns) == 1
-    ticks = np.arange(120)
-    arrival = [(energy[row].sum(axis=0) * ticks).sum() / energy[row].sum() for row in range(4)]
-    # 7.5 mrad a row are 3.9 ns, 7.7 bins.
-    assert np.all(np.diff(arrival) < -4)
 
 
 def test_foreign_integrators_are_refused():

@@ -132,22 +132,19 @@ def test_patches_have_their_reflectance_and_area():
 
 
 @each_row(
-    ("parameters", "message"),
-    [
-        ({"ripple_height": 0.1}, "ripple_height = 0.1 must be at most 0.3 of ripple_length = 0.2"),
-        ({"ripple_height": 0.01, "cell_size": 0.1}, "cell_size = 0.1 must be at most a quarter of ripple_length"),
-        ({"cell_size": 0.001}, "size = 20 with cell_size = 0.001 needs 20000 cells a side: allowed are 2048"),
-        ({"map_size": 4.0}, "map_size = 4.0 needs a height map"),
-        ({"origin_y": 4.0}, "origin_y = 4.0 needs a height map"),
-        ({"map_holes": "fill"}, "map_holes = fill needs a height map"),
-        ({"filename": "any.asc", "origin_x": 4.0}, "origin_x = 4.0 and origin_y = None must be given together"),
-        ({"filename": "nowhere.npy", "map_size": 4.0}, "cannot read nowhere.npy: No such file"),
-        ({"patches": "0 0 1 1.3"}, "patches: reflectance of number 1 = 1.3 must lie between 0 and 1"),
-        ({"patches": "0 0 1 0.3; 2 2 0 0.1"}, "patches: radius of number 2 = 0 must be greater than 0"),
-        ({"patches": "0 0 1"}, "patches: '0 0 1' must be four numbers, x y radius reflectance"),
-        ({"patches": "0 0 a 0.1"}, "patches: radius of number 1 = 'a' must be a number"),
-        ({"patches": "9 0 2 0.1", "refined_size": 20.0}, r"patches: number 1 reaches 11 m from \(0, 0\), but must"),
-    ],
+    ({"ripple_height": 0.1}, "ripple_height = 0.1 must be at most 0.3 of ripple_length = 0.2"),
+    ({"ripple_height": 0.01, "cell_size": 0.1}, "cell_size = 0.1 must be at most a quarter of ripple_length"),
+    ({"cell_size": 0.001}, "size = 20 with cell_size = 0.001 needs 20000 cells a side: allowed are 2048"),
+    ({"map_size": 4.0}, "map_size = 4.0 needs a height map"),
+    ({"origin_y": 4.0}, "origin_y = 4.0 needs a height map"),
+    ({"map_holes": "fill"}, "map_holes = fill needs a height map"),
+    ({"filename": "any.asc", "origin_x": 4.0}, "origin_x = 4.0 and origin_y = None must be given together"),
+    ({"filename": "nowhere.npy", "map_size": 4.0}, "cannot read nowhere.npy: No such file"),
+    ({"patches": "0 0 1 1.3"}, "patches: reflectance of number 1 = 1.3 must lie between 0 and 1"),
+    ({"patches": "0 0 1 0.3; 2 2 0 0.1"}, "patches: radius of number 2 = 0 must be greater than 0"),
+    ({"patches": "0 0 1"}, "patches: '0 0 1' must be four numbers, x y radius reflectance"),
+    ({"patches": "0 0 a 0.1"}, "patches: radius of number 1 = 'a' must be a number"),
+    ({"patches": "9 0 2 0.1", "refined_size": 20.0}, r"patches: number 1 reaches 11 m from \(0, 0\), but must"),
 )
 def test_invalid_parameters_are_named(parameters, message):
     with pytest.raises(RuntimeError, match=message):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse, refuses
 
 import mitransient_lidar
 from mitransient_lidar import results
@@ -12,13 +12,8 @@ from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_L
 from mitransient_lidar.rendering.derivatives import path_parameters
 
 FEW = {"type": "lidar_merging", "paths_per_pass": 1024, "photons_per_pass": 1024}
-LAYERS = {
-    "layer_tops": "0, 3",
-    "attenuation": "0.5, 0.3",
-    "scattering": "0.3, 0",
-    "backscattering": "0.01, 0",
-    "spectrum": "flat",
-}
+LAYERS = {"layer_tops": "0, 3", "attenuation": "0.5, 0.3", "scattering": "0.3, 0", "backscattering": "0.01, 0"}
+LAYERS |= {"spectrum": "flat"}
 
 
 @pytest.fixture(scope="module")
@@ -38,30 +33,25 @@ def test_layers_of_equal_water_stay_apart():
     assert len(path_parameters(renderer, "scattering")) == 2
 
 
-@each_row(
-    ("names", "message"),
-    [
-        (["atenuation"], r"derivatives = 'atenuation' must be one of attenuation\[0\], .*did you mean attenuation"),
-        (["attenuation[2]"], "must have the number of a layer, 0 to 1"),
-        (["attenuation", "attenuation[1]"], r"attenuation\[1\] is given twice"),
-        (["scattering[1]"], r"scattering\[1\]: the layer has scattering = 0"),
-        (["phase_g"], "phase_g: the water has no phase function hg"),
-        (["surface_reflectance"], "derivatives = 'surface_reflectance' must be one of"),
-        ([3], "derivatives = 3 must be one of"),
-        (5, "derivatives = 5 must be names of parameters"),
-    ],
+@refuses(
+    (["atenuation"], r"derivatives = 'atenuation' must be one of attenuation\[0\], .*did you mean attenuation"),
+    (["attenuation[2]"], "must have the number of a layer, 0 to 1"),
+    (["attenuation", "attenuation[1]"], r"attenuation\[1\] is given twice"),
+    (["scattering[1]"], r"scattering\[1\]: the layer has scattering = 0"),
+    (["phase_g"], "phase_g: the water has no phase function hg"),
+    (["surface_reflectance"], "derivatives = 'surface_reflectance' must be one of"),
+    ([3], "derivatives = 3 must be one of"),
+    (5, "derivatives = 5 must be names of parameters"),
 )
-def test_unknown_names_are_refused(renderer, names, message):
-    with pytest.raises(UserError, match=message):
-        path_parameters(renderer, names)
+def test_unknown_names_are_refused(names, renderer):
+    path_parameters(renderer, names)
 
 
-@each_row("water", [{"phase_function": "petzold"}, {"phase_function": "hg", "phase_g": 0.9}])
-def test_backscattering_without_influence_is_refused(lidar_scene, water):
+@each_row({"phase_function": "petzold"}, {"phase_function": "hg", "phase_g": 0.9})
+def test_backscattering_without_influence_is_refused(water, lidar_scene):
     scene = lidar_scene(integrator=FEW, water=water)
     renderer = scene.integrator().prepare(scene, scene.sensors()[0])
-    with pytest.raises(UserError, match="backscattering: the light does not depend on it"):
-        path_parameters(renderer, ["backscattering"])
+    must_refuse("backscattering: the light does not depend on it", path_parameters, renderer, ["backscattering"])
 
 
 @pytest.mark.parametrize("phase_g", [0.0, 0.02, -0.3])
@@ -115,8 +105,7 @@ def test_results_with_derivatives(tmp_path):
     assert held.identical(shot)
     again = mitransient_lidar.render(tmp_path / "shot.nc")
     np.testing.assert_array_equal(again["waveform_derivative"], shot["waveform_derivative"])
-    with pytest.raises(UserError, match="cannot store the variable"):
-        results.save(shot, tmp_path / "shot.exr")
+    must_refuse("cannot store the variable", results.save, shot, tmp_path / "shot.exr")
 
 
 @pytest.mark.slow

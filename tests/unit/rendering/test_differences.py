@@ -3,8 +3,8 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_row, refuses
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scenes import choose_integrator, open_scene
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.rendering.derivatives import Differences, default_step
@@ -46,16 +46,13 @@ def test_a_pass_is_the_difference_of_two_renders(level):
     assert np.isfinite(found.light.power.stderr).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "shift_ns"),
-    [
-        ("bottom_depth", 2 * 1.34 / 0.299792458),
-        ("altitude", 2 / 0.299792458),
-        # Edges of layers by a tenth.
-        ("layer_tops[1]", 1.34 / 0.299792458),
-    ],
+@each_row(
+    ("bottom_depth", 2 * 1.34 / 0.299792458),
+    ("altitude", 2 / 0.299792458),
+    # Edges of layers by a tenth.
+    ("layer_tops[1]", 1.34 / 0.299792458),
 )
-def test_steps_of_depths_shift_echoes_by_a_twentieth_of_the_pulse(level, name, shift_ns):
+def test_steps_of_depths_shift_echoes_by_a_twentieth_of_the_pulse(name, shift_ns, level):
     session, integrator = level
     renderer = integrator.prepare(session.scene, session.sensor)
     assert default_step(name, 8.0, renderer) * shift_ns == pytest.approx(0.05 * 5.0)
@@ -71,33 +68,23 @@ def test_steps_off_nadir_shift_the_surface_as_much(level):
     assert default_step("off_nadir_deg", 0.0, renderer) == 0.5
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "step"),
-    [
-        ("divergence_mrad", 10, 1.0),
-        ("target_x", 0, 0.05),
-        ("attenuation[1]", 0.5, 0.005),
-        ("wind_direction_deg", 0, 0.5),
-    ],
+@each_row(
+    ("divergence_mrad", 10, 1.0), ("target_x", 0, 0.05), ("attenuation[1]", 0.5, 0.005), ("wind_direction_deg", 0, 0.5)
 )
-def test_steps_of_others(level, name, value, step):
+def test_steps_of_others(name, value, step, level):
     session, integrator = level
     assert default_step(name, value, integrator.prepare(session.scene, session.sensor)) == pytest.approx(step)
 
 
-@pytest.mark.parametrize(
-    ("names", "steps", "message"),
-    [
-        (["botom_depth"], {}, "'botom_depth' is not one of the scene: did you mean bottom_depth"),
-        (["layout"], {}, "layout = '2x2' is not a number"),
-        (["bin_width_ns"], {}, "bin_width_ns = 1 belongs to the record"),
-        (["bottom_depth"], {"bottom_depth": 0.0}, "step of bottom_depth = 0 must be greater than 0"),
-        (["bottom_depth"], {"bottom_depth": 7.0}, "bottom_depth = 8 needs values 7 below and above, and layer_tops ="),
-    ],
+@refuses(
+    (["botom_depth"], {}, "'botom_depth' is not one of the scene: did you mean bottom_depth"),
+    (["layout"], {}, "layout = '2x2' is not a number"),
+    (["bin_width_ns"], {}, "bin_width_ns = 1 belongs to the record"),
+    (["bottom_depth"], {"bottom_depth": 0.0}, "step of bottom_depth = 0 must be greater than 0"),
+    (["bottom_depth"], {"bottom_depth": 7.0}, "bottom_depth = 8 needs values 7 below and above, and layer_tops ="),
 )
-def test_refused_parameters_and_steps(level, names, steps, message):
-    with pytest.raises(UserError, match=message):
-        Differences(*level, names, steps=steps)
+def test_refused_parameters_and_steps(names, steps, level):
+    Differences(*level, names, steps=steps)
 
 
 def test_the_sea_of_a_changed_scene_has_the_same_cells_and_waves():

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import xarray as xr
+from rows import each_case, must_refuse
 
 import mitransient_lidar
 from mitransient_lidar.core import validation
@@ -82,16 +83,13 @@ def test_records_that_exceed_the_memory_are_refused():
         mitransient_lidar.record(result, "apd", shots=10**9)
 
 
-@pytest.mark.parametrize(
-    ("integrator", "count"), [("lidar_merging", "photons_per_pass"), ("lidar_volpath", "paths_per_pass")]
-)
+@each_case(("lidar_merging", "photons_per_pass"), ("lidar_volpath", "paths_per_pass"))
 def test_passes_that_exceed_the_memory_are_refused(integrator, count, monkeypatch):
     session = open_scene("table1", {"bin_count": 100, "time_start_ns": 1400, "spectrum": "flat"})
     options = mi.load_dict({"type": integrator, count: 2**28}, parallel=False)
     renderer = options.prepare(session.scene, session.sensor)
     monkeypatch.setattr(validation, "usable_memory", lambda: 2e9)
-    with pytest.raises(UserError, match=rf"2684\d+ .*paths take .* GB of memory, .*: take fewer .*{count}"):
-        renderer.render_pass(0)
+    must_refuse(rf"2684\d+ .*paths take .* GB of memory, .*: take fewer .*{count}", renderer.render_pass, 0)
 
 
 def fitted(monkeypatch, memory, **layout):
@@ -135,14 +133,10 @@ def test_a_pass_of_cut_buffers_has_the_bits_of_one_of_large_ones(monkeypatch):
 
 def test_meshes_series_and_frames_that_exceed_the_memory_are_refused(monkeypatch):
     monkeypatch.setattr(validation, "usable_memory", lambda: 1e9)
-    with pytest.raises(UserError, match=r"1 meshes of 2114 x 2114 cells take 1\.25 GB"):
-        grid_indices(2048, 50_000)
-    with pytest.raises(UserError, match=r"1 meshes of 17592186044416 x 17592186044416 cells"):
-        grid_indices(2**44, 50_000)
-    with pytest.raises(UserError, match=r"64 meshes of 5.. x 5.. cells take .* GB"):
-        grid_indices(512, 1000, 2.0, meshes=64)
-    with pytest.raises(UserError, match=r"1000 shots of 4 pixels x 4000 bins take 1\.02 GB"):
-        check_size(1000, 4, 4000)
+    must_refuse(r"1 meshes of 2114 x 2114 cells take 1\.25 GB", grid_indices, 2048, 50_000)
+    must_refuse(r"1 meshes of 17592186044416 x 17592186044416 cells", grid_indices, 2**44, 50_000)
+    must_refuse(r"64 meshes of 5.. x 5.. cells take .* GB", grid_indices, 512, 1000, 2.0, meshes=64)
+    must_refuse(r"1000 shots of 4 pixels x 4000 bins take 1\.02 GB", check_size, 1000, 4, 4000)
     with pytest.raises(UserError, match=r"1000 frames of 65536 pixels take 3\.94 GB"):
         render_passive("passive_sea", {"layout": "256x256"}, frames=1000)
 
@@ -192,9 +186,7 @@ TASKS = {
 LONG = ("bins", "derivatives", "sea", "photons", "shots", "record", "passive", "frames")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.long if name in LONG else pytest.mark.slow) for name in TASKS]
-)
+@each_case(*zip([pytest.param(name, marks=pytest.mark.long if name in LONG else pytest.mark.slow) for name in TASKS]))
 def test_the_estimate_is_within_a_factor_of_two_of_the_peak(name, tmp_path):
     estimate, peak = limited(TASKS[name][0], tmp_path / "record.nc", TASKS[name][1])
     assert 0.5 < estimate / peak < 2, (estimate, peak)
@@ -220,13 +212,10 @@ print(found[0], 1.024e-6 * peak)
 """
 
 
-@pytest.mark.parametrize(
-    ("layout", "light", "max_memory"),
-    [
-        pytest.param("256x256", "maps", 0.7, marks=pytest.mark.slow),
-        pytest.param("640x512", "merging", 2, marks=pytest.mark.long),
-        pytest.param("1280x1024", "maps", 1.85, marks=pytest.mark.long),
-    ],
+@each_case(
+    pytest.param("256x256", "maps", 0.7, marks=pytest.mark.slow),
+    pytest.param("640x512", "merging", 2, marks=pytest.mark.long),
+    pytest.param("1280x1024", "maps", 1.85, marks=pytest.mark.long),
 )
 def test_images_take_the_memory_that_is_stated_before_the_render(layout, light, max_memory, tmp_path):
     gates = {"gate_start_ns": 1411, "gate_width_ns": 10, "gate_step_ns": 2.4, "gate_count": 40, "layout": layout}

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_case
 from significance import assert_same
 
 from mitransient_lidar.loading import catalogue
@@ -47,29 +48,23 @@ def clock(monkeypatch):
     return state
 
 
-@pytest.mark.parametrize(
-    ("limit", "kernels", "rest", "expected", "trials"),
-    [
-        (4.0, 1e-3, 0.0, 1.0, 0),  # 6.6 million rays: below 2 million a second
-        (1.0, 1e-3, 0.0, 2**-2, 2),  # a full pass takes 0.51 s, and the trials a little
-        (1.1, 1e-3, 0.0, 1.0, 2),
-        (1.0, 0.1, 0.0, 2**-8, 2),  # the trials take 0.2 s, and each of four passes as long
-        (1.0, 0.1, 0.15, 2**-9, 2),  # the trials take 0.5 s
-        (1.0, 0.1, 0.25, 2**-8, 2),  # the other work takes longer than the kernels
-        (1.0, 40.0, 0.2, 2**-9, 1),  # the first trial exceeds the limit
-    ],
+@each_case(
+    (4.0, 1e-3, 0.0, 1.0, 0),  # 6.6 million rays: below 2 million a second
+    (1.0, 1e-3, 0.0, 2**-2, 2),  # a full pass takes 0.51 s, and the trials a little
+    (1.1, 1e-3, 0.0, 1.0, 2),
+    (1.0, 0.1, 0.0, 2**-8, 2),  # the trials take 0.2 s, and each of four passes as long
+    (1.0, 0.1, 0.15, 2**-9, 2),  # the trials take 0.5 s
+    (1.0, 0.1, 0.25, 2**-8, 2),  # the other work takes longer than the kernels
+    (1.0, 40.0, 0.2, 2**-9, 1),  # the first trial exceeds the limit
 )
-def test_the_share_of_the_paths(clock, limit, kernels, rest, expected, trials):
+def test_the_share_of_the_paths(limit, kernels, rest, expected, trials, clock):
     clock.kernels, clock.rest = kernels, rest
     renderer, share, first = pass_size.fit_to_time(Renderer(), limit, 20.0, seed=1, gates=None)
     assert (share, renderer.share, clock.trials) == (expected, expected, trials)
     assert first == (f"record {trials}" if share == pass_size.SMALLEST_SHARE else None)
 
 
-@pytest.mark.parametrize(
-    "integrator",
-    [pytest.param("lidar_merging", marks=pytest.mark.slow), pytest.param("lidar_volpath", marks=pytest.mark.long)],
-)
+@each_case(pytest.param("lidar_merging", marks=pytest.mark.slow), pytest.param("lidar_volpath", marks=pytest.mark.long))
 def test_small_passes_have_the_mean_of_full_ones(integrator):
     """Energy in four gates of table1: 24 passes of a 64th of the paths, and 8 full ones.
 

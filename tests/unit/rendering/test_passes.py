@@ -1,16 +1,20 @@
-"""The loop over passes: goals, forecasts, empty records and time limits, with passes that render nothing."""
+"""Passes until their number, the error or the time ends a render, and its options."""
 
 import contextlib
+import inspect
 import re
 import signal
+from dataclasses import fields
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse, refuses
 
+import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.options import declared
 from mitransient_lidar.rendering import passes
-from mitransient_lidar.rendering.passes import SMALLEST_PASS_COUNT, Goal, Progress, run_passes
+from mitransient_lidar.rendering.passes import SMALLEST_PASS_COUNT, Goal, Progress, RenderOptions, run_passes
 
 
 class Clock:
@@ -67,8 +71,8 @@ def test_the_forecast_is_that_of_the_passes_that_follow(monkeypatch, caplog):
     assert "95 % of the bins of lit pixels reached 0.218; the target takes about 100 passes and 218 s" in caplog.text
 
 
-@each_row(("limit", "expected"), [(1.0, 2), (8.0, 2), (9.0, 3), (10.9, 3), (40.0, 18)])
-def test_no_pass_begins_that_would_end_after_the_time(monkeypatch, limit, expected):
+@each_row((1.0, 2), (8.0, 2), (9.0, 3), (10.9, 3), (40.0, 18))
+def test_no_pass_begins_that_would_end_after_the_time(limit, expected, monkeypatch):
     """The first pass takes 5 s and the others 2 s; two passes are the least."""
     clock = Clock(monkeypatch, 5.0, 2.0)
     log = run_passes(clock.render_pass, Goal(max_time=limit), seed=0)
@@ -83,21 +87,16 @@ def test_empty_passes_end_with_an_error(monkeypatch, goal, ended):
     def verify(count):
         raise UserError(f"no light in {count} passes")
 
-    with pytest.raises(UserError, match=f"no light in {ended} passes"):
-        run_passes(clock.render_pass, goal, seed=0, verify=verify)
+    must_refuse(f"no light in {ended} passes", run_passes, clock.render_pass, goal, seed=0, verify=verify)
     assert clock.passes == ended
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ((None, None, 4, Goal(), 0.5), "target_quantile = 0.5 needs a target_error"),
-        ((0.1, None, None, Goal(), float("nan")), "target_quantile = nan must be finite"),
-    ],
+@refuses(
+    ((None, None, 4, Goal(), 0.5), "target_quantile = 0.5 needs a target_error"),
+    ((0.1, None, None, Goal(), float("nan")), "target_quantile = nan must be finite"),
 )
-def test_quantiles_out_of_range_are_refused(options, sentence):
-    with pytest.raises(UserError, match=re.escape(sentence)):
-        Goal.from_options(*options)
+def test_quantiles_out_of_range_are_refused(options):
+    Goal.from_options(*options)
 
 
 def test_the_progress_line_names_the_request_and_its_forecast():
@@ -110,8 +109,7 @@ def test_the_progress_line_names_the_request_and_its_forecast():
 
 
 @pytest.mark.parametrize(("at", "kept"), [(2, False), (4, True)])
-def test_an_interruption_waits_for_its_pass_alone(monkeypatch, at, kept):
-    """One during the passes that a result needs was once ignored until their end."""
+def test_an_interruption_waits_for_its_pass_alone(monkeypatch, default_ctrl_c, at, kept):
     clock = Clock(monkeypatch, 1.0)
 
     def render_pass(number, seed):
@@ -119,10 +117,26 @@ def test_an_interruption_waits_for_its_pass_alone(monkeypatch, at, kept):
             signal.raise_signal(signal.SIGINT)
         return clock.render_pass(number, seed)
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with contextlib.nullcontext() if kept else pytest.raises(KeyboardInterrupt):
-            assert run_passes(render_pass, Goal(passes=9), seed=0, smallest=3).interrupted
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with contextlib.nullcontext() if kept else pytest.raises(KeyboardInterrupt):
+        assert run_passes(render_pass, Goal(passes=9), seed=0, smallest=3).interrupted
     assert clock.passes == at
+
+
+NAMES = [one.name for one in fields(RenderOptions)]
+
+
+def test_render_has_all_options_and_documents_their_ranges():
+    parameters = inspect.signature(mitransient_lidar.render).parameters
+    assert set(NAMES) < set(parameters)
+    parts = re.split(r"^(\w[\w, ]*)\n(?=    )", inspect.getdoc(mitransient_lidar.render), flags=re.MULTILINE)
+    described = {name: text for names, text in zip(parts[1::2], parts[2::2], strict=True) for name in names.split(", ")}
+    for name, (_, option) in declared(RenderOptions).items():
+        assert option.range() in " ".join(described[name].split()), name
+
+
+def test_values_at_the_ends_are_accepted_and_texts_are_numbers():
+    for name, (_, option) in declared(RenderOptions).items():
+        for value in () if option.low is None else {option.high if option.above else option.low, option.high} - {None}:
+            error = {"target_error": 1.0} if name == "target_quantile" else {}
+            assert getattr(RenderOptions(**{name: value}, **error), name) == value
+    assert RenderOptions(max_time="5").max_time == 5.0

@@ -7,8 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import run
-from rows import each_row
+from rows import each_case, each_row, must_refuse
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
@@ -62,9 +61,9 @@ class Beam:
         self.pose = KernelPose(*(turn @ vector for vector in (pose.origin, pose.axis, pose.far, pose.left)))
 
 
-@each_row(("k_x", "k_y"), [(0.9, 0.0), (0.3, -0.8), (-0.5, 0.5)])
-@each_row("azimuth", [0.0, 0.7])
-def test_truth_is_the_mean_of_a_wave_over_an_elliptic_gaussian(k_x, k_y, azimuth):
+@each_row((0.9, 0.0), (0.3, -0.8), (-0.5, 0.5))
+@each_row(0.0, 0.7)
+def test_truth_is_the_mean_of_a_wave_over_an_elliptic_gaussian(azimuth, k_x, k_y):
     """In closed form the wave is damped by exp(-(k_a^2 s_a^2 + k_c^2 s_c^2)/2); s_c is 5 mrad of 261 m, s_a longer."""
     x, y, across = 3.17, -8.4, 5e-3 * 200 / math.cos(math.radians(40))
     along = across / math.cos(math.radians(40))
@@ -102,20 +101,17 @@ def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):
 
 
 @each_row(
-    ("water", "depth", "expected"),
-    [
-        # Kd is that of Jerlov's table and b as measured; the rest follows by the sources of `water_types.jerlov`.
-        ({"jerlov": "5C"}, [4.0, np.nan], {"true_kd": 0.3072, "true_scattering": 1.21}),
-        ({"kd": 0.1}, [4.0], {"true_kd": 0.1}),
-        ({"secchi": 10}, [4.0], {"true_kd": 0.17, "true_attenuation": 0.7}),
-        # Petzold's San Diego harbour.
-        ({"petzold": "turbid"}, [4.0], {"true_absorption": 0.366, "true_scattering": 1.824}),
-        # Half of the scattering by molecules is backscattering.
-        ({"pure": "true"}, [4.0], {"true_scattering": 0.00196, "true_backscattering": 0.00098}),
-        # 3 of 8 m are the upper layer.
-        ({"jerlov": "1C, 7C", "layer_tops": "0, 3"}, [8.0], {"true_kd": (3 * 0.1272 + 5 * 0.4816) / 8}),
-        ({"jerlov": "1C, 7C", "layer_tops": "0, 3"}, [np.nan], {"true_kd": np.nan, "true_scattering": np.nan}),
-    ],
+    # Kd is that of Jerlov's table and b as measured; the rest follows by the sources of `water_types.jerlov`.
+    ({"jerlov": "5C"}, [4.0, np.nan], {"true_kd": 0.3072, "true_scattering": 1.21}),
+    ({"kd": 0.1}, [4.0], {"true_kd": 0.1}),
+    ({"secchi": 10}, [4.0], {"true_kd": 0.17, "true_attenuation": 0.7}),
+    # Petzold's San Diego harbour.
+    ({"petzold": "turbid"}, [4.0], {"true_absorption": 0.366, "true_scattering": 1.824}),
+    # Half of the scattering by molecules is backscattering.
+    ({"pure": "true"}, [4.0], {"true_scattering": 0.00196, "true_backscattering": 0.00098}),
+    # 3 of 8 m are the upper layer.
+    ({"jerlov": "1C, 7C", "layer_tops": "0, 3"}, [8.0], {"true_kd": (3 * 0.1272 + 5 * 0.4816) / 8}),
+    ({"jerlov": "1C, 7C", "layer_tops": "0, 3"}, [np.nan], {"true_kd": np.nan, "true_scattering": np.nan}),
 )
 def test_coefficients_of_waters_by_name(water, depth, expected):
     medium = mi.load_dict({"type": "layered_water", **{name: str(value) for name, value in water.items()}})
@@ -230,12 +226,8 @@ def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     assert series.attrs["interrupted"] == 1
 
 
-@pytest.mark.parametrize(
-    ("module", "name", "called"),
-    [(single, "render", "render"), (single, "render_again", "render"), (shot_series, *["render_shots"] * 2)],
-)
-def test_an_interruption_of_the_first_of_two_channels_ends_the_render(monkeypatch, module, name, called):
-    """The other channel was once rendered to its end, though there was nothing to join it to."""
+@each_row((single, "render", "render"), (single, "render_again", "render"), (shot_series, *["render_shots"] * 2))
+def test_an_interruption_of_the_first_of_two_channels_ends_the_render(module, name, called, monkeypatch):
     calls = []
     function = getattr(module, name)
     monkeypatch.setattr(module, called, lambda *_, **__: calls.append(called) or xr.Dataset(attrs={"interrupted": 1}))
@@ -247,41 +239,18 @@ def test_an_interruption_of_the_first_of_two_channels_ends_the_render(monkeypatc
     assert calls == [called]
 
 
-@pytest.mark.slow
-def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, tmp_path):
-    whole = shot_batches.ShotBatches.render
-
-    def interrupted(batches, poses, seeds):
-        if seeds[0] == 1:
-            raise KeyboardInterrupt
-        return whole(batches, poses, seeds)
-
-    monkeypatch.setattr(shot_batches.ShotBatches, "render", interrupted)
-    (tmp_path / "places.csv").write_text("x,y\n1,2\n3,4  # the last\n")
-    arguments = ["-D", "spectrum=flat", "--places", tmp_path / "places.csv", "-o", tmp_path / "new" / "shots.nc"]
-    done = run("shots", "fig09_2x2", *arguments)
-    assert done.exit_code == 130
-    assert done.stdout.splitlines()[0] == str(tmp_path / "new" / "shots.nc")
-    assert done.stderr.splitlines()[-1] == "interrupted after 1 of the shots; their result is kept"
-    assert results.open(tmp_path / "new" / "shots.nc")["aim_y"].values.tolist() == [2.0]
-
-
-@pytest.mark.parametrize(
-    ("scene", "options", "message"),
-    [
-        ("fig09_2x2", {"positions": [(0, 0, 1)]}, r"positions of shape \(1, 3\) must be 1 to 100000 pairs"),
-        ("fig09_2x2", {"positions": []}, r"positions of shape \(0,\) must be 1 to 100000 pairs"),
-        ("fig09_2x2", {"positions": [(0, math.nan)]}, "positions holds nan"),
-        ("fig09_2x2", {"positions": "here"}, "positions = 'here' must hold numbers only"),
-        ("fig09_2x2", {"positions": [(0, -2e7)]}, r"positions = -2e\+07 must lie between"),
-        ("fig09_2x2", {"positions": [(0, 1e5), (0, 1e6)]}, "positions are 900000 m apart along x or y: at most 20000"),
-        ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 2]}, r"shot_passes of shape \(2,\) must be one number"),
-        ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 9, 2]}, "shot_passes = 9 must lie between 2 and 8"),
-        ("fig09_2x2", {"count": 3}, "every shot on a flat sea is the same"),
-        ("fig09_2x2", {"positions": PLACES, "move_target": True}, "has no parameter target_x, which move_target needs"),
-    ],
+@each_case(
+    ("fig09_2x2", {"positions": [(0, 0, 1)]}, r"positions of shape \(1, 3\) must be 1 to 100000 pairs"),
+    ("fig09_2x2", {"positions": []}, r"positions of shape \(0,\) must be 1 to 100000 pairs"),
+    ("fig09_2x2", {"positions": [(0, math.nan)]}, "positions holds nan"),
+    ("fig09_2x2", {"positions": "here"}, "positions = 'here' must hold numbers only"),
+    ("fig09_2x2", {"positions": [(0, -2e7)]}, r"positions = -2e\+07 must lie between"),
+    ("fig09_2x2", {"positions": [(0, 1e5), (0, 1e6)]}, "positions are 900000 m apart along x or y: at most 20000"),
+    ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 2]}, r"shot_passes of shape \(2,\) must be one number"),
+    ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 9, 2]}, "shot_passes = 9 must lie between 2 and 8"),
+    ("fig09_2x2", {"count": 3}, "every shot on a flat sea is the same"),
+    ("fig09_2x2", {"positions": PLACES, "move_target": True}, "has no parameter target_x, which move_target needs"),
 )
-def test_invalid_input_is_refused_before_rendering(rendered, scene, options, message):
-    with pytest.raises(UserError, match=message):
-        shot_series.render_shots(scene, FLAT, **options)
+def test_invalid_input_is_refused_before_rendering(scene, options, message, rendered):
+    must_refuse(message, shot_series.render_shots, scene, FLAT, **options)
     assert not rendered

@@ -9,6 +9,7 @@ import OpenEXR
 import pytest
 from command_line import run
 from few_paths import few_paths
+from rows import must_refuse
 from small_results import made
 
 from mitransient_lidar import results
@@ -54,7 +55,6 @@ def test_more_than_ten_thousand_bins_have_five_digits(tmp_path):
 
 @pytest.mark.slow
 def test_channels_beyond_the_memory_leave_the_other_files(tmp_path, monkeypatch):
-    """A million bins took 10 GB of memory, after their render."""
     monkeypatch.setattr(validation, "usable_memory", lambda: 1e6)
     with pytest.raises(UserError, match=r"2000 channels of an EXR file take 0.005 GB of memory, and at most 0.001 GB"):
         results.save(light(np.zeros((1, 1, 500))), tmp_path / "a.exr")
@@ -87,11 +87,9 @@ def test_every_truncation_and_a_flipped_byte_are_detected(tmp_path, capfd):
     data = whole.read_bytes()
     for length in range(9, len(data), 5):
         part.write_bytes(data[:length])
-        with pytest.raises(UserError, match=r"part\.exr is damaged or truncated"):
-            results.open(part)
+        must_refuse(r"part\.exr is damaged or truncated", results.open, part)
     part.write_bytes(data[:-20] + bytes([data[-20] ^ 255]) + data[-19:])
-    with pytest.raises(UserError, match="damaged"):
-        results.open(part)
+    must_refuse("damaged", results.open, part)
     assert capfd.readouterr() == ("", "")
 
 
@@ -104,8 +102,7 @@ def test_threads_that_read_damaged_files_change_nothing_of_the_process(tmp_path,
         if number % 2:
             results.open(tmp_path / "a.exr")
         else:
-            with pytest.raises(UserError, match="damaged"):
-                results.open(tmp_path / "b.exr")
+            must_refuse("damaged", results.open, tmp_path / "b.exr")
         # Another one may print while a file is read.
         sys.stdout.write(f"{number}\n")
 

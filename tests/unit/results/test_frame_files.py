@@ -117,7 +117,6 @@ def test_frames_of_seas():
 
 
 def test_commands(frames, tmp_path):
-    """Case 29: `view` and `gates` of frames write pages, drawings and images, in digital numbers."""
     path = tmp_path / "record.nc"
     results.save(frames, path)
     assert "signal above the dark level" in view(frames).page

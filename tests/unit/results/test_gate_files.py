@@ -6,23 +6,14 @@ import numpy as np
 import OpenImageIO
 import pytest
 import xarray as xr
+from rows import must_refuse
 
 from mitransient_lidar import results
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.results import exr, files
 from mitransient_lidar.results.gate_stack import check_stack
 
-ATTRIBUTES = {
-    "scene": "mine field",
-    "seed": 2**40,
-    "gate_rise_ns": 0.1,
-    "gate_step_ns": 5.0,
-    "pulses": 100,
-    "nothing": [],
-    "one": [1.5],
-    "names": ["rød", ""],
-    "surface_time_ns": 1420.0625,
-}
+ATTRIBUTES = {"scene": "mine field", "seed": 2**40, "gate_rise_ns": 0.1, "gate_step_ns": 5.0, "pulses": 100}
+ATTRIBUTES |= {"nothing": [], "one": [1.5], "names": ["rød", ""], "surface_time_ns": 1420.0625}
 
 
 def make(rows=4, columns=5, gates=3, attributes=ATTRIBUTES, seed=7):
@@ -50,7 +41,6 @@ def make(rows=4, columns=5, gates=3, attributes=ATTRIBUTES, seed=7):
 
 
 def save_sequence(stack, folder, stem):
-    """Write a sequence, and return its files."""
     exr.write_sequence(check_stack(stack), folder, stem)
     return [folder / f"{stem}_gate{k:03d}.exr" for k in range(stack.sizes["gate"])]
 
@@ -160,19 +150,16 @@ def test_what_is_left_out_and_what_needs_netcdf(tmp_path):
     results.save(both, tmp_path / "a.exr")
     xr.testing.assert_identical(results.open(tmp_path / "a.exr"), stack)
     more = stack.assign(contrast=("gate", [1.0, 2.0, 3.0]))
-    with pytest.raises(UserError, match=r"cannot store the variable contrast; use a \.nc file"):
-        results.save(more, tmp_path / "b.exr")
+    must_refuse(r"cannot store the variable contrast; use a \.nc file", results.save, more, tmp_path / "b.exr")
     assert not (tmp_path / "b.exr").exists()
     results.save(more, tmp_path / "b.nc")
     xr.testing.assert_identical(results.open(tmp_path / "b.nc"), more)
 
 
 def test_wrong_names(tmp_path):
-    with pytest.raises(UserError, match="without folders"):
-        save_sequence(make(), tmp_path, "a/b")
+    must_refuse("without folders", save_sequence, make(), tmp_path, "a/b")
     (tmp_path / "file").write_text("text")
-    with pytest.raises(UserError, match="cannot write"):
-        save_sequence(make(), tmp_path / "file", "a")
+    must_refuse("cannot write", save_sequence, make(), tmp_path / "file", "a")
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".nc"])
@@ -182,34 +169,27 @@ def test_damaged_files_are_rejected(tmp_path, suffix, capfd):
     data = whole.read_bytes()
     for length in {*range(8, len(data), 61), len(data) - 1}:
         part.write_bytes(data[:length])
-        with pytest.raises(UserError, match=r"part\.\w+ is damaged or truncated"):
-            results.open(part)
+        must_refuse(r"part\.\w+ is damaged or truncated", results.open, part)
     assert capfd.readouterr() == ("", "")
 
 
 def test_incomplete_sequences_are_rejected(tmp_path, caplog):
     old = save_sequence(make(seed=1, gates=4), tmp_path, "a")
-    with pytest.raises(UserError, match=r"is gate 2 of a sequence: open the folder or the first file, a_gate000\.exr"):
-        results.open(old[2])
+    must_refuse(r"is gate 2 of a sequence: open the folder or the first file, a_gate000\.exr", results.open, old[2])
     of_old = old[1].read_bytes()
     new = save_sequence(make(seed=2), tmp_path, "a")
     assert "a_gate003.exr does not belong to this sequence of 3 gates" in caplog.text
     xr.testing.assert_identical(results.open(tmp_path), make(seed=2))
     new[1].write_bytes(of_old)
-    with pytest.raises(UserError, match="its 3 gates belong to different stacks"):
-        results.open(tmp_path)
+    must_refuse("its 3 gates belong to different stacks", results.open, tmp_path)
     new[1].unlink()
-    with pytest.raises(UserError, match=r"a_gate001\.exr: gate 1 of the 3 gates of the sequence is missing"):
-        results.open(tmp_path)
+    must_refuse(r"a_gate001\.exr: gate 1 of the 3 gates of the sequence is missing", results.open, tmp_path)
     new[0].rename(tmp_path / "first.exr")
-    with pytest.raises(UserError, match=r"its name must end in _gate000\.exr"):
-        results.open(tmp_path / "first.exr")
-    with pytest.raises(UserError, match="holds no sequence of gates"):
-        results.open(tmp_path)
+    must_refuse(r"its name must end in _gate000\.exr", results.open, tmp_path / "first.exr")
+    must_refuse("holds no sequence of gates", results.open, tmp_path)
     for stem in ("b", "c"):
         save_sequence(make(), tmp_path, stem)
-    with pytest.raises(UserError, match=r"2 sequences of gates: open the first file of one \(b_gate000\.exr, c_"):
-        results.open(tmp_path)
+    must_refuse(r"2 sequences of gates: open the first file of one \(b_gate000\.exr, c_", results.open, tmp_path)
 
 
 def test_large_stacks_are_written_without_copies_and_read_exactly(tmp_path, monkeypatch):

@@ -15,17 +15,9 @@ from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, lid
 C0 = 0.299792458  # m/ns
 THETA, N, GROUP = math.radians(20), 1.34, 1.364
 COS_WATER = math.sqrt(1 - (math.sin(THETA) / N) ** 2)
-ATTRIBUTES = {
-    "altitude": 200.0,
-    "off_nadir_deg": 20.0,
-    "refractive_index": N,
-    "group_index": GROUP,
-    "field_of_view_mrad": 30.0,
-    "divergence_mrad": 10.0,
-    "pulse_energy_mj": 5.0,
-    "aperture_area": 0.025,
-    "two_way_efficiency": 0.9**2 * 0.8,
-}
+ATTRIBUTES = {"altitude": 200.0, "off_nadir_deg": 20.0, "refractive_index": N, "group_index": GROUP}
+ATTRIBUTES |= {"field_of_view_mrad": 30.0, "divergence_mrad": 10.0, "pulse_energy_mj": 5.0, "aperture_area": 0.025}
+ATTRIBUTES |= {"two_way_efficiency": 0.9**2 * 0.8}
 
 
 def test_times_depths_and_paths():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
-from rows import each_row
+from rows import each_row, must_refuse, refuses
 from waveform_writers import Packets, Return, Sampling, Segment, Shot, write_las, write_pulse_waves
 
 import mitransient_lidar
@@ -180,8 +180,7 @@ def test_pulse_waves(tmp_path, appended):
     np.testing.assert_array_equal(segments["signal"].values[:, 0], [one.samples for one in listed])
     starts = [7 + 100 + 0.01 * one.duration - 0.25 for one in listed]
     np.testing.assert_allclose(segments["sample_start_ns"].values[:, 0], starts)
-    with pytest.raises(UserError, match=r"has samples 0\.5 and 1 ns apart: choose one channel"):
-        read_waveforms(tmp_path / "one.pls")
+    must_refuse(r"has samples 0\.5 and 1 ns apart: choose one channel", read_waveforms, tmp_path / "one.pls")
     with pytest.raises(UserError, match=r"has no waveform of channel 0"):  # that of the outgoing pulse
         read_waveforms(tmp_path / "one.pls", channel=0)
 
@@ -222,13 +221,12 @@ WRONG_LAS = {
 }
 
 
-@each_row("case", WRONG_LAS)
-def test_wrong_las_files_are_refused(tmp_path, case):
+@each_row(*zip(WRONG_LAS))
+def test_wrong_las_files_are_refused(case, tmp_path):
     change, message = WRONG_LAS[case]
     las_with(tmp_path / "bad.las")
     change(tmp_path / "bad.las")
-    with pytest.raises(UserError, match=message):
-        read_waveforms(tmp_path / "bad.las")
+    must_refuse(message, read_waveforms, tmp_path / "bad.las")
 
 
 def pls_with(path, sampling=None, **options):
@@ -256,29 +254,24 @@ WRONG_PLS = {
 }
 
 
-@each_row("case", WRONG_PLS)
-def test_wrong_pulse_waves_files_are_refused(tmp_path, case):
+@each_row(*zip(WRONG_PLS))
+def test_wrong_pulse_waves_files_are_refused(case, tmp_path):
     change, message = WRONG_PLS[case]
     pls_with(tmp_path / "bad.pls")
     change(tmp_path / "bad.pls")
-    with pytest.raises(UserError, match=message):
-        read_waveforms(tmp_path / "bad.pls")
+    must_refuse(message, read_waveforms, tmp_path / "bad.pls")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"waveforms": (3, 3)}, "waveforms = 3:3 must end after 3, the first one"),
-        ({"waveforms": (-1, 3)}, "waveforms = -1 must lie between 0"),
-        ({"channel": "one"}, "channel = one must be a number, or the name of a field"),
-        ({"lidar": {"altitud": 3}}, "lidar states altitud, which is none of altitude, sea_level"),
-        ({"lidar": {"pulse_fwhm_ns": -3}}, "lidar has the attribute pulse_fwhm_ns = -3"),
-    ],
+@refuses(
+    ({"waveforms": (3, 3)}, "waveforms = 3:3 must end after 3, the first one"),
+    ({"waveforms": (-1, 3)}, "waveforms = -1 must lie between 0"),
+    ({"channel": "one"}, "channel = one must be a number, or the name of a field"),
+    ({"lidar": {"altitud": 3}}, "lidar states altitud, which is none of altitude, sea_level"),
+    ({"lidar": {"pulse_fwhm_ns": -3}}, "lidar has the attribute pulse_fwhm_ns = -3"),
 )
-def test_wrong_selections_are_refused(tmp_path, options, message):
+def test_wrong_selections_are_refused(options, tmp_path):
     las_with(tmp_path / "one.las")
-    with pytest.raises(UserError, match=message):
-        open_file(tmp_path / "one.las", **options)
+    open_file(tmp_path / "one.las", **options)
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path):

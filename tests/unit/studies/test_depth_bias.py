@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 import xarray as xr
+from rows import must_refuse
 
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import UserError
@@ -75,8 +76,7 @@ def test_level_seas_are_rendered_as_often_as_waves_have_places(rendered, monkeyp
     assert options[0]["positions"] == options[1]["positions"] == 4 * [(0.0, 0.0)]
     assert options[2]["count"] == 4
     assert table.attrs["level_renders"] == 4
-    with pytest.raises(UserError, match="target_error = 0 must be greater than 0"):
-        study.depth_bias("riegl_vq840g", target_error=0.0, **seas)
+    must_refuse("target_error = 0 must be greater than 0", study.depth_bias, "riegl_vq840g", target_error=0.0, **seas)
 
 
 def test_bottoms_that_errors_of_the_render_hide_are_counted(monkeypatch):
@@ -133,8 +133,7 @@ def test_uncertainty_refuses_wrong_input_before_it_renders(rendered):
         ({"estimator": "eye"}, "estimator = 'eye' must be one of threshold"),
         ({"params": {"altitude": "high"}}, "altitude = 'high' must be a number"),
     ):
-        with pytest.raises(UserError, match=message):
-            tpu("riegl_vq840g", **options)
+        must_refuse(message, tpu, "riegl_vq840g", **options)
     assert not rendered
 
 

@@ -87,12 +87,9 @@ def test_error_of_a_ratio_is_that_of_repeated_experiments():
 
 
 @each_row(
-    ("holds", "value", "error", "share"),
-    [
-        *(("yes", 4.5, 0.1, None), ("yes", 4.5, 0.1, 0.6), ("partly", 4.5, 0.1, 0.2), ("partly", 5.15, 0.1, None)),
-        *(("partly", 5.15, 0.1, 0.2), ("no", 6.0, 0.1, None), ("partly", 6.0, 0.1, 0.6), ("no", 3.0, 0.1, 0.4)),
-        ("no", math.nan, 0.1, 0.4),
-    ],
+    *(("yes", 4.5, 0.1, None), ("yes", 4.5, 0.1, 0.6), ("partly", 4.5, 0.1, 0.2), ("partly", 5.15, 0.1, None)),
+    *(("partly", 5.15, 0.1, 0.2), ("no", 6.0, 0.1, None), ("partly", 6.0, 0.1, 0.6), ("no", 3.0, 0.1, 0.4)),
+    ("no", math.nan, 0.1, 0.4),
 )
 def test_whether_a_statement_holds(holds, value, error, share):
     assert Statement("fig10", "s", "q", "4 to 5", value, error, (4.0, 5.0), "w", share).holds == holds

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from command_line import assert_refused, run
-from rows import each_row
+from rows import each_case, each_row
 from scipy.integrate import trapezoid
 
 from mitransient_lidar.physics.water import water_types
@@ -39,14 +39,11 @@ def figures(output):
 
 
 @each_row(
-    ("arguments", "wanted"),
-    [
-        ("jerlov II", water_types.jerlov("II")),
-        ("chlorophyll 1", water_types.chlorophyll(1.0)),
-        ("kd 0.1", water_types.from_kd(0.1)),
-        ("secchi 6", water_types.from_secchi(6.0)),
-        ("pure", water_types.pure_seawater()),
-    ],
+    ("jerlov II", water_types.jerlov("II")),
+    ("chlorophyll 1", water_types.chlorophyll(1.0)),
+    ("kd 0.1", water_types.from_kd(0.1)),
+    ("secchi 6", water_types.from_secchi(6.0)),
+    ("pure", water_types.pure_seawater()),
 )
 def test_every_kind_is_printed_and_can_be_rendered(arguments, wanted):
     named, options = figures(run("scenes", "water", *arguments.split()).stdout)
@@ -61,30 +58,23 @@ def test_every_kind_is_printed_and_can_be_rendered(arguments, wanted):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["mud", "3"], "kind = 'mud' must be one of jerlov"),
-        (["jerlov"], "value is missing: jerlov needs one"),
-        (["pure", "3"], "value = '3' must be left out"),
-        (["kd", "clear"], "value = 'clear' must be a number for kd"),
-        (["kd", "0.1", "--wavelength", "500"], "wavelength = 500 must be 532, or 700 to 1100, for kd"),
-        (["petzold", "muddy"], "value = 'muddy' must be one of clear, coastal, turbid, autec_7, "),
-        (["petzold", "clear", "--wavelength", "600"], "wavelength = 600 must lie between 514 and 533, or above"),
-        (["profile", "missing.csv"], "cannot read missing.csv: No such file"),
-        (["jerlov", "II", "-o", "a.txt"], "cannot write a.txt: the file name must end in .png, .pdf or .svg"),
-        (["pure", "-o", "missing/a.png"], "cannot write missing/a.png: No such file"),
-    ],
+@each_case(
+    (["mud", "3"], "kind = 'mud' must be one of jerlov"),
+    (["jerlov"], "value is missing: jerlov needs one"),
+    (["pure", "3"], "value = '3' must be left out"),
+    (["kd", "clear"], "value = 'clear' must be a number for kd"),
+    (["kd", "0.1", "--wavelength", "500"], "wavelength = 500 must be 532, or 700 to 1100, for kd"),
+    (["petzold", "muddy"], "value = 'muddy' must be one of clear, coastal, turbid, autec_7, "),
+    (["petzold", "clear", "--wavelength", "600"], "wavelength = 600 must lie between 514 and 533, or above"),
+    (["profile", "missing.csv"], "cannot read missing.csv: No such file"),
+    (["jerlov", "II", "-o", "a.txt"], "cannot write a.txt: the file name must end in .png, .pdf or .svg"),
+    (["pure", "-o", "missing/a.png"], "cannot write missing/a.png: No such file"),
 )
 def test_mistakes_are_one_sentence(arguments, message):
     assert_refused(run("scenes", "water", *arguments), message)
 
 
-@each_row(
-    ("name", "a", "b", "ratio"),
-    # a and b of his table at 530 nm, and bb/b to its two digits (Petzold 1972).
-    [("clear", 0.114, 0.037, 0.044), ("coastal", 0.179, 0.219, 0.013), ("turbid", 0.366, 1.824, 0.020)],
-)
+@each_row(("clear", 0.114, 0.037, 0.044), ("coastal", 0.179, 0.219, 0.013), ("turbid", 0.366, 1.824, 0.020))
 def test_petzold_waters(name, a, b, ratio):
     done = run("scenes", "water", "petzold", name)
     assert "measured at 514 to 530 nm" in done.stdout
@@ -136,19 +126,16 @@ def test_pure_sea_water_renders():
         mi.load_dict({"type": "layered_water", **values})
 
 
-@pytest.mark.parametrize(
-    ("kind", "value", "label", "share", "at_1_degree", "tolerance"),
-    [
-        # Zhang, Hu and He (2009): 2.2975e-4 / 0.001962 forwards as backwards.
-        ("pure", None, "pure sea water, bb/b = 0.5", 0.5, 0.1171, 1e-3),
-        # Petzold's 16.623 over his 0.219 at 1 degree.
-        ("petzold", "coastal", "measured, bb/b = 0.0134", 0.0134, 75.9, 0.02),
-        # Mobley, Sundman and Boss (2002): n = 1.10 and mu = 3.5835 for particles of 0.0183, whose function is 72.78 at
-        # 1 degree; of b = 0.936 molecules scatter 0.00196, a half of it backwards.
-        ("secchi", "6", "Fournier-Forand and molecules, bb/b = 0.0193", 0.01931, 72.63, 2e-3),
-    ],
+@each_row(
+    # Zhang, Hu and He (2009): 2.2975e-4 / 0.001962 forwards as backwards.
+    ("pure", None, "pure sea water, bb/b = 0.5", 0.5, 0.1171, 1e-3),
+    # Petzold's 16.623 over his 0.219 at 1 degree.
+    ("petzold", "coastal", "measured, bb/b = 0.0134", 0.0134, 75.9, 0.02),
+    # Mobley, Sundman and Boss (2002): n = 1.10 and mu = 3.5835 for particles of 0.0183, whose function is 72.78 at
+    # 1 degree; of b = 0.936 molecules scatter 0.00196, a half of it backwards.
+    ("secchi", "6", "Fournier-Forand and molecules, bb/b = 0.0193", 0.01931, 72.63, 2e-3),
 )
-def test_every_kind_draws_its_function(monkeypatch, kind, value, label, share, at_1_degree, tolerance):
+def test_every_kind_draws_its_function(kind, value, label, share, at_1_degree, tolerance, monkeypatch):
     drawn = []
     monkeypatch.setattr("mitransient_lidar.plots.water.plot_phase_function", lambda *arguments: drawn.append(arguments))
     plot_water(kind, value, 532.0, 20.0, 35.0, 0.01, "a.png")

@@ -1,9 +1,10 @@
-"""Depth of the bottoms of a scene, and waves that follow it in rendered scenes."""
+"""Depths of bottoms below places, and objects within plugins."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.physics.sea.shoaling import ShoalingHeights
 from mitransient_lidar.transport.scene_parts import seas_of
@@ -67,3 +68,41 @@ def test_waves_know_the_bottom_only_where_it_limits_them():
     assert 4 * np.std(vertices(sea)[:, 2]) < 0.3
     assert sea.used_values["shoaling"] == "bottom"
     assert float(scene.bbox().min.z) == pytest.approx(-0.5)
+
+
+SEABED = {"type": "seabed", "depth": 8.0, "size": 20.0}
+WATER = {"type": "ocean_surface", "spectrum": "flat", "interior": {"type": "layered_water", "plume_scattering": 1.0}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phase", ["hg", "petzold", "fournier_forand"])
+def test_no_plugin_calls_the_loader(monkeypatch, phase):
+    """A loader within the loader replaces the file resolver that other threads use: 1 in 10 processes then failed."""
+
+    def refuse(*_, **__):
+        raise AssertionError("load_dict within the constructor of a plugin")
+
+    load_file = mi.load_file
+    monkeypatch.setattr(mi, "load_dict", refuse)
+    assert open_scene("table1", {"phase_function": phase, "spectrum": "flat"}).scene.shapes()
+    assert load_file(str(catalogue.scene_path("ship_wake")), ship_x="0").shapes()
+
+
+def test_seabed_and_bubbles_are_made_without_the_loader(monkeypatch):
+    """They hold a texture and a phase function of their own."""
+    for description in (SEABED, WATER):
+        load_dict = mi.load_dict
+        with monkeypatch.context() as patch:
+            patch.setattr(mi, "load_dict", lambda *_, **__: pytest.fail("a plugin calls the loader"))
+            assert load_dict(description).bbox().valid()
+
+
+def test_all_loading_is_serial(monkeypatch):
+    """Mitsuba's own plugins are found in one thread."""
+    asked = []
+    instantiate = mi.parser.instantiate
+    monkeypatch.setattr(
+        mi.parser, "instantiate", lambda config, parsed: asked.append(config.parallel) or instantiate(config, parsed)
+    )
+    open_scene("table1", {"spectrum": "flat"})
+    assert asked == [False]

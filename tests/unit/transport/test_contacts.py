@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from rows import each_row
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport import contacts
@@ -84,16 +85,13 @@ def test_meshes_and_instances_that_lie_on_the_bottom_are_seen(lidar_scene, ply):
     assert {name: tuple(by.round(1)) for name, by in moved.items()} == {"mesh": (0, 0, 0.1), "instance": (0, 0, 0.1)}
 
 
-@pytest.mark.parametrize(
-    ("extra", "names", "reason"),
-    [
-        ({"a": solid("rectangle", 0.4, 0, 0, 0)}, ("a", "sea"), "the surface of the water"),
-        ({"a": solid("cube", 0.4, 0, 0, -0.4)}, ("a", "sea"), "the surface of the water"),
-        ({name: solid("rectangle", 0.4, 0, 0, -4) for name in "ab"}, "ab", "not defined which one is seen"),
-        ({"a": solid("cube", 0.4, 0, 0, -4), "b": solid("cube", 0.4, 0.3, 0, -4)}, "ab", "not defined which one"),
-    ],
+@each_row(
+    ({"a": solid("rectangle", 0.4, 0, 0, 0)}, ("a", "sea"), "the surface of the water"),
+    ({"a": solid("cube", 0.4, 0, 0, -0.4)}, ("a", "sea"), "the surface of the water"),
+    ({name: solid("rectangle", 0.4, 0, 0, -4) for name in "ab"}, "ab", "not defined which one is seen"),
+    ({"a": solid("cube", 0.4, 0, 0, -4), "b": solid("cube", 0.4, 0.3, 0, -4)}, "ab", "not defined which one"),
 )
-def test_solids_that_coincide_without_order_are_refused(lidar_scene, extra, names, reason):
+def test_solids_that_coincide_without_order_are_refused(extra, names, reason, lidar_scene):
     with pytest.raises(UserError, match=f"shapes '.*' and '.*' coincide in a face.*{reason}") as refusal:
         moves(lidar_scene(extra=extra))
     assert all(repr(name) in str(refusal.value) for name in names)

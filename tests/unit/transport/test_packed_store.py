@@ -1,4 +1,6 @@
-"""Storage of what parts of paths carry."""
+"""Photons in packed arrays, and lanes of paths that share a kernel."""
+
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -10,6 +12,7 @@ from mitransient_lidar.transport.merging.segments import PackedStore
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.paths.passes import PathClasses
 from mitransient_lidar.transport.paths.path import PathPoint
+from mitransient_lidar.transport.rng import Lanes, starts, tiled
 
 #: Zero, numbers from the smallest to the largest of single precision, and those that are not finite.
 NUMBERS = np.float32([0, 1e-45, 1.2e-38, 0.1, 3.4e38, np.inf, np.nan, -np.nan])
@@ -64,3 +67,40 @@ def test_photons_are_stored_without_loss():
     pairs += [(getattr(found, name), getattr(point, name)) for name in names]
     for stored, given in pairs:
         np.testing.assert_array_equal(np.array(stored), np.array(given))
+
+
+@dataclass(frozen=True)
+class Part:
+    """One array of the shots, one of all shots, and a table that is no array of shots."""
+
+    OF_SHOTS = ("place", "width", "start")
+
+    place: mi.Point2f
+    width: mi.Float
+    start: mi.UInt32
+    table: mi.Float
+
+
+class Whole:
+    OF_SHOTS = ("parts",)
+
+    def __init__(self, part):
+        self.parts = [part, None]
+
+
+def test_lanes_pick_what_their_shots_have():
+    """Of each shot three times in turn, in lanes of two paths each; without a change of the objects themselves."""
+    part = Part(mi.Point2f([1, 2], [3, 4]), mi.Float(7), starts(2, 10), mi.Float([5, 6]))
+    whole = Whole(part)
+    several = tiled(whole, 3)
+    lanes = Lanes.of_paths(dr.arange(mi.UInt32, 12), 6, 2)
+    found, none = lanes.pick(several).parts
+    shot = np.repeat([0, 1], 6)
+    np.testing.assert_array_equal(np.array(found.place), [1 + shot, 3 + shot])
+    np.testing.assert_array_equal(np.array(found.start), 10 * shot)
+    assert (dr.width(found.width), found.width[0], none) == (1, 7, None)
+    np.testing.assert_array_equal(np.array(found.table), [5, 6])
+    assert whole.parts[0] is part
+    assert dr.width(part.place) == 2
+    alone = Lanes.of_paths(dr.arange(mi.UInt32, 4), 1, 4).pick(Part(mi.Point2f(1, 3), mi.Float(7), starts(1, 10), None))
+    assert dr.width(alone.place) == 1

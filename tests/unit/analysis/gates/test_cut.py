@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from oracles.gates import transmission
-from rows import each_row
+from rows import each_row, refuses
 from scipy.integrate import quad
 from scipy.stats import norm
 from small_results import made
@@ -19,15 +19,8 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import gate_stack
 
 START, WIDTH, BINS = 1400.0, 0.5, 240
-GEOMETRY = {
-    "scene": "fig09",
-    "altitude": 200.0,
-    "surface_time_ns": 1420.0,
-    "refractive_index": 1.34,
-    "group_index": 1.364,
-    "off_nadir_deg": 20.0,
-    "passes": 16,
-}
+GEOMETRY = {"scene": "fig09", "altitude": 200.0, "surface_time_ns": 1420.0, "refractive_index": 1.34}
+GEOMETRY |= {"group_index": 1.364, "off_nadir_deg": 20.0, "passes": 16}
 
 
 def power(t):
@@ -48,15 +41,11 @@ def record(scale=(1.0, 2.0, 0.5), grid=None, relative=0.02, attributes=None, val
     return made(waveform, relative * np.abs(waveform), start=START, step=WIDTH, **places, **about)
 
 
-@pytest.mark.parametrize(
-    "train",
-    [
-        GateTrain(1412.0, 10.0, 5.0, 17),
-        GateTrain(1412.3, 7.77, 3.1, 20),
-        GateTrain(1412.3, 8.0, 3.1, 20, 2.5, 4.0),
-        GateTrain.measured(GateShape.sampled([0, 2, 6, 12], [0, 0.9, 0.7, 0]), 1415.0, 4.0, 15),
-    ],
-    ids=["bins", "sharp", "edges", "measured"],
+@each_row(
+    GateTrain(1412.0, 10.0, 5.0, 17),
+    GateTrain(1412.3, 7.77, 3.1, 20),
+    GateTrain(1412.3, 8.0, 3.1, 20, 2.5, 4.0),
+    GateTrain.measured(GateShape.sampled([0, 2, 6, 12], [0, 0.9, 0.7, 0]), 1415.0, 4.0, 15),
 )
 def test_gates_integrate_the_waveform(train):
     stack = gating.cut_gates(record(), train)
@@ -141,20 +130,16 @@ def test_nan_stays_in_its_gates():
     assert np.isfinite(stack["gate_energy"][0]).all()
 
 
-@each_row(
-    ("train", "message"),
-    [
-        (GateTrain(1402.0, 5.0, 5.0, 3), r"before the surface: .* closes at 1417\.0 ns.* arrives at 1420\.0 ns"),
-        (GateTrain(1530.0, 5.0, 5.0, 3), r"gate 0 is open from 1530\.0 to 1535\.0 ns.* the record, 1400\.0 to 1520"),
-        (GateTrain(1500.0, 5.0, 5.0, 5), r"gate 4 is open from 1520\.0 to 1525\.0"),
-        (GateTrain(1399.9, 5.0, 5.0, 9), r"gate 0 is open from 1399\.9"),
-        # Half heights within the record, the edge outside
-        (GateTrain(1500.0, 5.0, 5.0, 4, 0.0, 2.0), r"gate 3 is open from 1515\.0 to 1521\.7"),
-    ],
+@refuses(
+    (GateTrain(1402.0, 5.0, 5.0, 3), r"before the surface: .* closes at 1417\.0 ns.* arrives at 1420\.0 ns"),
+    (GateTrain(1530.0, 5.0, 5.0, 3), r"gate 0 is open from 1530\.0 to 1535\.0 ns.* the record, 1400\.0 to 1520"),
+    (GateTrain(1500.0, 5.0, 5.0, 5), r"gate 4 is open from 1520\.0 to 1525\.0"),
+    (GateTrain(1399.9, 5.0, 5.0, 9), r"gate 0 is open from 1399\.9"),
+    # Half heights within the record, the edge outside
+    (GateTrain(1500.0, 5.0, 5.0, 4, 0.0, 2.0), r"gate 3 is open from 1515\.0 to 1521\.7"),
 )
-def test_trains_outside_the_record_are_rejected(train, message):
-    with pytest.raises(UserError, match=message):
-        gating.cut_gates(record(), train)
+def test_trains_outside_the_record_are_rejected(train):
+    gating.cut_gates(record(), train)
 
 
 def test_train_before_a_record_of_unknown_surface():
@@ -213,17 +198,13 @@ def test_gates_narrower_than_bins_are_cut_with_a_warning_of_the_error(caplog):
     assert f"than the bins of 5 ns: the energy of an echo may be wrong by up to {100 * bound:.0f} %" in caplog.text
 
 
-@each_row(
-    ("options", "message"),
-    [
-        ({"width_ns": 5.0}, "one start: start_ns, start_depth_m or start_range_m"),
-        ({"start_ns": 1.0, "start_depth_m": 1.0, "width_ns": 5.0}, "one start"),
-        ({"start_ns": 1.0}, "one shape: either width_ns or a profile file"),
-        ({"start_ns": 1.0, "width_ns": 5.0, "profile_file": "gate.txt"}, "one shape"),
-        ({"start_ns": 1.0, "profile_file": "gate.txt", "rise_ns": 2.0}, "must be 0 with a profile"),
-        ({"start_ns": 1.0, "profile_file": "missing.txt"}, r"cannot read missing\.txt: No such file"),
-    ],
+@refuses(
+    ({"width_ns": 5.0}, "one start: start_ns, start_depth_m or start_range_m"),
+    ({"start_ns": 1.0, "start_depth_m": 1.0, "width_ns": 5.0}, "one start"),
+    ({"start_ns": 1.0}, "one shape: either width_ns or a profile file"),
+    ({"start_ns": 1.0, "width_ns": 5.0, "profile_file": "gate.txt"}, "one shape"),
+    ({"start_ns": 1.0, "profile_file": "gate.txt", "rise_ns": 2.0}, "must be 0 with a profile"),
+    ({"start_ns": 1.0, "profile_file": "missing.txt"}, r"cannot read missing\.txt: No such file"),
 )
-def test_options_that_do_not_go_together(options, message):
-    with pytest.raises(UserError, match=message):
-        gate_stack.train_from_options(GEOMETRY, **options)
+def test_options_that_do_not_go_together(options):
+    gate_stack.train_from_options(GEOMETRY, **options)

@@ -1,16 +1,15 @@
-"""Fisher information of records: closed forms, correlated noise, and fits of simulated records."""
+"""Fisher information of records and its bounds, against closed forms."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from differentiated import PHOTON, result
-from rows import each_row
+from rows import refuses
 from significance import largest_chi2, largest_z
 
-from mitransient_lidar.analysis.information.fisher import fisher_information
+from mitransient_lidar.analysis.information.fisher import bounds, fisher_information
 from mitransient_lidar.analysis.receiver import detect_waveforms
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser
@@ -28,7 +27,6 @@ BY_NAME = {"height": DECAY / HEIGHT, "rate": -T * DECAY}
 
 
 def decay(photons=1.0, **options):
-    """Return a result with the decay, its height and rate."""
     slopes = {name: photons * PHOTON * one for name, one in BY_NAME.items()}
     return result(photons * PHOTON * DECAY, slopes, **options)
 
@@ -230,18 +228,44 @@ def test_parameters_without_influence_and_degenerate_pairs():
     assert "height and nearly have a correlation of -0.99" in found.attrs["remarks"]
 
 
-@each_row(
-    ("change", "options", "message"),
-    [
-        (lambda data: data.drop_vars("waveform_derivative"), {}, "has no waveform_derivative"),
-        (lambda data: data.assign(waveform_derivative=np.nan * data["waveform_derivative"]), {}, "not finite"),
-        (lambda data: [data, data.assign_coords(time=data["time"] + 1)], {}, "the renders differ in time"),
-        (lambda data: [], {}, "must hold at least one result"),
-        (lambda data: data, {"nuisances": {"phase": 1.0}}, "nuisance = 'phase' must be one of time_offset, scale"),
-        (lambda data: data, {"nuisances": {"scale": 0.0}}, "scale = 0.0 must be a standard deviation above 0"),
-        (lambda data: data.assign(waveform_derivative=0 * data["waveform_derivative"]), {}, "no information"),
-    ],
+@refuses(
+    (lambda data: data.drop_vars("waveform_derivative"), {}, "has no waveform_derivative"),
+    (lambda data: data.assign(waveform_derivative=np.nan * data["waveform_derivative"]), {}, "not finite"),
+    (lambda data: [data, data.assign_coords(time=data["time"] + 1)], {}, "the renders differ in time"),
+    (lambda data: [], {}, "must hold at least one result"),
+    (lambda data: data, {"nuisances": {"phase": 1.0}}, "nuisance = 'phase' must be one of time_offset, scale"),
+    (lambda data: data, {"nuisances": {"scale": 0.0}}, "scale = 0.0 must be a standard deviation above 0"),
+    (lambda data: data.assign(waveform_derivative=0 * data["waveform_derivative"]), {}, "no information"),
 )
-def test_invalid_input(change, options, message):
-    with pytest.raises(UserError, match=message):
-        fisher_information(change(decay()), **{"chain": "ideal", **options})
+def test_invalid_input(change, options):
+    fisher_information(change(decay()), **{"chain": "ideal", **options})
+
+
+def test_bounds_of_two_parameters_in_closed_form():
+    """1/sqrt(F_aa (1 - r^2)) for a correlation r of the derivatives, and -r for the estimates, in any units."""
+    r = 0.6
+    matrix = np.array([[4.0, r * 2 * 1e6], [r * 2 * 1e6, 1e12]])
+    found = bounds(matrix, ["a", "b"])
+    np.testing.assert_allclose(found.bound_known, [0.5, 1e-6])
+    np.testing.assert_allclose(found.bound, [0.5 / 0.8, 1e-6 / 0.8])
+    np.testing.assert_allclose(found.correlation, [[1, -r], [-r, 1]])
+    assert found.smallest == pytest.approx(1 - r)
+    assert found.remarks == []
+
+
+def test_parameters_beside_a_degenerate_pair_keep_their_bounds():
+    matrix = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 25.0]])
+    found = bounds(matrix, ["a", "b", "c"])
+    np.testing.assert_allclose(found.bound, [np.inf, np.inf, 0.2])
+    assert np.isnan(found.correlation[0]).all()
+    assert found.remarks == ["a and b cannot be told apart by the record: no bounds"]
+
+
+def test_a_matrix_that_noise_makes_indefinite_is_no_degeneracy():
+    found = bounds(np.array([[1.0, 1.1], [1.1, 1.0]]), ["a", "b"])
+    assert np.isinf(found.bound).all()
+    (remark,) = found.remarks
+    assert remark.startswith("the noise of the render hides what the record tells about a and b (eigenvalue -0.1")
+    found = bounds(np.zeros((2, 2)), ["a", "b"])
+    assert np.isinf(found.bound).all()
+    assert found.remarks == [f"{name} has no influence on the record: no bound" for name in "ab"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from closed_form_waveform import BIN, TIME, TRUTH, closed_form, noisy
-from rows import each_row
+from rows import each_row, refuses
 from scipy.stats import chi2, kstest
 from significance import FALSE_ALARM, largest_z
 
@@ -222,7 +222,7 @@ def test_impossible_steps_are_shortened_and_the_fit_goes_on():
     np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=1e-4)
 
 
-@each_row("complete", [0, 1, 2, 3, 4])
+@each_row(0, 1, 2, 3, 4)
 def test_an_interrupted_fit_has_its_last_step(complete):
     """Ctrl-C in the render after so many, of an approach with a coarse model and of the fit that follows it."""
     renders = []
@@ -265,29 +265,19 @@ def test_some_pixels_are_fitted_by_their_names():
         fit(data, model=lambda values: closed_form(values, pixels=("a", "b")))
 
 
-@each_row(
-    ("options", "message"),
-    [
-        (
-            {"starts": {**TRUTH, "bottom_reflectance": 1.2}},
-            "start of bottom_reflectance = 1.2 must lie between 0 and 1",
-        ),
-        ({"starts": {"scale": 1.0}}, "start of scale: it is fixed"),
-        ({"starts": {}}, "free = '' must name at least one parameter"),
-        ({"starts": {"depth": 3.0}}, "no derivative by depth, only by attenuation, scattering, bottom_reflectance"),
-        ({"bounds": {"attenuation": (0.4, 0.3)}}, "bounds of attenuation = 0.4, 0.3 must increase"),
-        ({"bounds": {"scattered": (0, 1)}}, "bounds of scattered: it is not one of the free parameters attenuation"),
-        (
-            {"model": lambda values: closed_form(values, TIME + 500)},
-            "have 0 samples from 0 to 159 ns within the record",
-        ),
-        ({"model": lambda values: closed_form(values).drop_vars("waveform_derivative")}, "no variable waveform_deriv"),
-        ({"model": lambda values: np.inf * closed_form(values)}, "waveform of the model has 160 values"),
-    ],
+@refuses(
+    ({"starts": {**TRUTH, "bottom_reflectance": 1.2}}, "start of bottom_reflectance = 1.2 must lie between 0 and 1"),
+    ({"starts": {"scale": 1.0}}, "start of scale: it is fixed"),
+    ({"starts": {}}, "free = '' must name at least one parameter"),
+    ({"starts": {"depth": 3.0}}, "no derivative by depth, only by attenuation, scattering, bottom_reflectance"),
+    ({"bounds": {"attenuation": (0.4, 0.3)}}, "bounds of attenuation = 0.4, 0.3 must increase"),
+    ({"bounds": {"scattered": (0, 1)}}, "bounds of scattered: it is not one of the free parameters attenuation"),
+    ({"model": lambda values: closed_form(values, TIME + 500)}, "have 0 samples from 0 to 159 ns within the record"),
+    ({"model": lambda values: closed_form(values).drop_vars("waveform_derivative")}, "no variable waveform_deriv"),
+    ({"model": lambda values: np.inf * closed_form(values)}, "waveform of the model has 160 values"),
 )
-def test_invalid_input_is_refused(options, message):
-    with pytest.raises(UserError, match=message):
-        fit(noisy(0.002, np.random.default_rng(8)), **options)
+def test_invalid_input_is_refused(options):
+    fit(noisy(0.002, np.random.default_rng(8)), **options)
 
 
 def test_samples_without_value_or_error_are_left_out(tmp_path):

@@ -29,7 +29,6 @@ def rows_of(c, rho, depth):
 
 
 def model(values):
-    """Return the waveform and its derivatives by differences."""
     point = np.array([values[name] for name in TRUTH])
     steps = 1e-4 * point * np.eye(3)
     slopes = [(rows_of(*(point + step)) - rows_of(*(point - step))) / (2 * step.sum()) for step in steps]
@@ -50,7 +49,6 @@ def write(path, signal, times):
 
 
 def shot(path, receiver="riegl_vq840g", seed=1):
-    """Write a recorded shot of the truth."""
     recorded = detect_waveforms(model(TRUTH), receiver, seed=seed, gain="auto")
     return write(path, recorded["signal"].values.ravel(), recorded["time"].values)
 

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from rows import each_case
 from synthetic_shots import (
     BB,
     C0,
@@ -133,9 +134,7 @@ def test_layers_leave_no_reflectance_that_looks_sure():
     assert float(one["reflectance_stderr"][2]) < 0.2 * float(one["reflectance"][2])
 
 
-@pytest.mark.parametrize(
-    ("target_depth", "end", "summed"), [(None, 500, True), (DEPTH - 1.5, 500, False), (None, 3.5, False)]
-)
+@each_case((None, 500, True), (DEPTH - 1.5, 500, False), (None, 3.5, False))
 def test_energy_of_a_bottom_is_the_sum_only_where_its_light_is_alone(target_depth, end, summed):
     """A target 1.5 m, less than four echo widths, above the bottom; a record that ends 3.5 echo widths behind it."""
     values = waveform(share=1.0) + (0 if target_depth is None else 0.5 * waveform(depth=target_depth, glint=0.0))

@@ -35,7 +35,7 @@ def test_water_of_its_own_level_and_decay():
         np.testing.assert_allclose(values, A + 0.0019623 + (BB - 0.0019623 / 2) / ratio, rtol=1e-4)
 
 
-@each_row("name", ["jerlov I", "jerlov 9C", "chlorophyll 0.01", "chlorophyll 30", "petzold turbid"])
+@each_row("jerlov I", "jerlov 9C", "chlorophyll 0.01", "chlorophyll 30", "petzold turbid")
 def test_bounds_of_attenuation_include_waters_by_name(name):
     water = water_of(*name.split())
     found = water_of_column(water.absorption, water.backscattering / (2 * np.pi), 0.0, 1.0)

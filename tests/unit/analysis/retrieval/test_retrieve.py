@@ -6,8 +6,7 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import assert_refused, run
-from rows import each_row
+from rows import must_refuse, refuses
 from scipy.stats import truncnorm
 from synthetic_shots import (
     ANGLE_X,
@@ -30,7 +29,6 @@ from synthetic_shots import (
     waveform,
 )
 
-from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieval_table, retrieve, surface_inputs
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.studies import shots as retrieval
@@ -61,8 +59,7 @@ def test_a_receiver_of_one_pixel_gives_bottom_and_water():
     # The error of the surface's range by a glint of 4 ns is an optical depth of 0.03.
     np.testing.assert_allclose(found["reflectance"], RHO, rtol=0.04)
     np.testing.assert_allclose([found["absorption"], found["backscattering"]], [A, BB], rtol=0.05)
-    with pytest.raises(UserError, match="at least 2 pixels"):
-        retrieve.surface_slopes(one)
+    must_refuse("at least 2 pixels", retrieve.surface_slopes, one)
 
 
 def test_the_tail_of_a_bottom_counts_and_its_focusing_does_not():
@@ -231,22 +228,6 @@ def test_no_estimate():
         retrieve.retrieve(result(np.full((4, BINS), 1e-12)))
 
 
-@pytest.mark.slow
-def test_command(tmp_path):
-    results.save(result(), tmp_path / "shot.nc")
-    written = tmp_path / "out" / "found.nc"
-    done = run("retrieve", tmp_path / "shot.nc", "-o", written, "--slope-deviation", "0.1,0.1")
-    assert done.exit_code == 0, done.output
-    for text in ("slope along: ", "bottom depth: 8.0", "bright 100", "water (1/m): a 0.1", "attenuation (1/m): c "):
-        assert text in done.output
-    expected = retrieve.retrieve(results.open(tmp_path / "shot.nc"), slope_deviation=(0.1, 0.1))
-    xr.testing.assert_allclose(xr.load_dataset(written, engine="h5netcdf"), expected)
-    results.save(result(field_of_view_mrad=20.0), tmp_path / "narrow.nc")
-    assert "too narrow" in run("retrieve", tmp_path / "narrow.nc").output
-    refused = run("retrieve", tmp_path / "shot.nc", "--slope-deviation", "0.1")
-    assert_refused(refused, "--slope-deviation = '0.1' must be two numbers")
-
-
 @pytest.fixture
 def shots_with_truth():
     """Three shots of level planes at other heights, with their truth."""
@@ -285,28 +266,23 @@ def drop(name):
     return shot
 
 
-@each_row(
-    ("call", "sentence"),
-    [
-        (lambda: retrieve.surface_slopes(on_axis().isel(pixel=[0])), "waveforms of at least 2 pixels"),
-        (lambda: retrieve.surface_slopes(drop("altitude")), "the dataset has no attribute altitude"),
-        (lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=0.1), r"wind_speed = 0\.1 must lie between 1 and 30"),
-        (lambda: retrieve.surface_slopes(result(), wind_speed=6), "wind_speed = 6 needs a result of a round Gaussian"),
-        *(
-            (
-                lambda name=name: retrieve.surface_slopes(of_a_sea(), slope_deviation=(0.1, 0.1), **{name: 6}),
-                f"slope_deviation = .* and {name} = 6 are alternatives",
-            )
-            for name in ("wind_speed", "wind_direction_deg")
-        ),
-        (lambda: retrieve.bottom(result().drop_vars("waveform"), LEVEL), "the dataset has no waveform"),
-        (lambda: retrieve.bottom(result(obscuration=2.0), LEVEL), "obscuration = 2.0: it must be a number between 0"),
-        (lambda: retrieve.bottom(drop("two_way_efficiency"), LEVEL), "efficiency must be given"),
-        (lambda: retrieve.water(result(field_of_view_mrad=20.0)), r"spot_diameter = 4\.2\d+ must be at least 6"),
-        (lambda: retrieve.water(result().isel(pixel=0)), r"waveform has the dimensions \('time',\)"),
-    ],
+@refuses(
+    (lambda: retrieve.surface_slopes(on_axis().isel(pixel=[0])), "waveforms of at least 2 pixels"),
+    (lambda: retrieve.surface_slopes(drop("altitude")), "the dataset has no attribute altitude"),
+    (lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=0.1), r"wind_speed = 0\.1 must lie between 1 and 30"),
+    (lambda: retrieve.surface_slopes(result(), wind_speed=6), "wind_speed = 6 needs a result of a round Gaussian"),
+    *(
+        (
+            lambda name=name: retrieve.surface_slopes(of_a_sea(), slope_deviation=(0.1, 0.1), **{name: 6}),
+            f"slope_deviation = .* and {name} = 6 are alternatives",
+        )
+        for name in ("wind_speed", "wind_direction_deg")
+    ),
+    (lambda: retrieve.bottom(result().drop_vars("waveform"), LEVEL), "the dataset has no waveform"),
+    (lambda: retrieve.bottom(result(obscuration=2.0), LEVEL), "obscuration = 2.0: it must be a number between 0"),
+    (lambda: retrieve.bottom(drop("two_way_efficiency"), LEVEL), "efficiency must be given"),
+    (lambda: retrieve.water(result(field_of_view_mrad=20.0)), r"spot_diameter = 4\.2\d+ must be at least 6"),
+    (lambda: retrieve.water(result().isel(pixel=0)), r"waveform has the dimensions \('time',\)"),
 )
-def test_invalid_input(call, sentence):
-    with pytest.raises(UserError, match=sentence) as refused:
-        call()
-    assert "\n" not in str(refused.value)
+def test_invalid_input(call):
+    call()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rows import each_case
 from significance import largest_z
 
 from mitransient_lidar.analysis.retrieval.surface_echoes import SeaShots
@@ -38,10 +39,8 @@ def plane_times(angle_x, angle_y, along, across, height=0.0, altitude=200.0, the
 
 
 @pytest.mark.parametrize("theta", [0.0, THETA, math.radians(60)])
-@pytest.mark.parametrize(
-    ("along", "across", "height"), [(0, 0, 0), (0.12, 0, 0.3), (-0.2, 0.07, -0.4), (0.05, -0.3, 0)]
-)
-def test_a_plane_is_found_exactly(theta, along, across, height):
+@each_case((0, 0, 0), (0.12, 0, 0.3), (-0.2, 0.07, -0.4), (0.05, -0.3, 0))
+def test_a_plane_is_found_exactly(along, across, height, theta):
     """Any sign, factor or convention that is wrong shows: the fit has no approximation."""
     times = plane_times(ANGLE_X, ANGLE_Y, along, across, height, theta=theta)
     plane = fit_plane(times[np.newaxis], POINTS, theta)

@@ -193,7 +193,6 @@ def test_error_rates_over_drawn_records():
 
 
 def test_depths_do_not_depend_on_how_many_delays_are_fitted_at_once(monkeypatch):
-    """The shortest delay alone once had no fit whose peak is that of the surface, and ended in a numpy error."""
     record = recorded([water(0.3), water(1.0, glint=0.2)], 1)
     together = found(record)
     monkeypatch.setattr(first_echoes, "_AT_ONCE", 1)

@@ -2,22 +2,19 @@
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_case, each_row, must_refuse
 from scipy.signal import fftconvolve
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Focusing
 from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape, Response, Template
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
 
 
-@pytest.mark.parametrize(
-    ("fwhm", "bin_ns", "tau"), [(1.5, 0.5, 0.8), (0.7, 1.0, 0.0), (5.0, 1.0, 3.0), (4.0, 0.5, 2.0)]
-)
+@each_case((1.5, 0.5, 0.8), (0.7, 1.0, 0.0), (5.0, 1.0, 3.0), (4.0, 0.5, 2.0))
 def test_other_shapes_are_sums_of_gaussians_within_a_hundredth(fwhm, bin_ns, tau):
     template = Template.of(Pulse.gaussian(fwhm), bin_ns, tau)
     shape = EchoShape.of(template)
@@ -32,7 +29,7 @@ def test_other_shapes_are_sums_of_gaussians_within_a_hundredth(fwhm, bin_ns, tau
     assert shape.width_of(np.array([wide]))[0][0] == pytest.approx((half[-1] - half[0]) * bin_ns / 15, rel=0.06)
 
 
-@each_row("name", ["apd", "pmt", "photodiode", "sipm", "ideal"])
+@each_row("apd", "pmt", "photodiode", "sipm", "ideal")
 def test_template_of_a_receiver_is_the_mean_record_of_an_echo(name):
     """Arrival, height and tail of the closed form of the receiver, which does not know of templates."""
     chain, bin_ns = RECEIVERS[name], 1.0
@@ -68,18 +65,10 @@ def test_onset_is_the_blurred_column_and_has_its_derivatives(sigma):
 
 
 @each_row(
-    ("depths", "factors"),
-    [
-        ([1.0, 2.0], [1.0]),
-        ([2.0, 1.0], [1.0, 1.0]),
-        ([1.0, 2.0], [1.0, -1.0]),
-        ("near", [1.0]),
-        ([0.0, 1.0], [2.0, 1.0]),
-    ],
+    ([1.0, 2.0], [1.0]), ([2.0, 1.0], [1.0, 1.0]), ([1.0, 2.0], [1.0, -1.0]), ("near", [1.0]), ([0.0, 1.0], [2.0, 1.0])
 )
 def test_invalid_focusing_is_refused(depths, factors):
-    with pytest.raises(UserError, match="wave_focusing"):
-        Focusing.from_attributes({"wave_focusing_depths": depths, "wave_focusing": factors})
+    must_refuse("wave_focusing", Focusing.from_attributes, {"wave_focusing_depths": depths, "wave_focusing": factors})
 
 
 @pytest.mark.parametrize("estimator", ["gaussian", "peak", "centroid"])

@@ -6,32 +6,18 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
-from lake_waveforms import (
-    BINS,
-    DECAY,
-    PER_NS,
-    SHIFTS,
-    SURFACE,
-    TIME,
-    column,
-    echo,
-    lit,
-    recorded,
-    result,
-    waveform,
-)
-from rows import each_row
+from lake_waveforms import BINS, DECAY, PER_NS, SHIFTS, SURFACE, TIME, column, echo, lit, recorded, result, waveform
+from rows import each_row, refuses
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.waveforms import csv_tables, echo_table
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
-from mitransient_lidar.core.errors import UserError
 
 #: Delays of targets behind the surface [ns], of four waveforms.
 PLACES = [[], [40], [40, 28], [44, 34, 54]]
 
 
-@each_row("estimator", echo_table.ESTIMATORS)
+@each_row(*zip(echo_table.ESTIMATORS))
 def test_isolated_echoes_without_noise(estimator):
     """Surface and bottom of a lake without a column: times within 0.02 ns, depth within 2 mm."""
     bottom = np.array([50.0, 60.13, 70.29, 80.41])
@@ -199,15 +185,12 @@ def test_csv_and_command(tmp_path):
     xr.testing.assert_equal(xr.load_dataset(tmp_path / "table.nc", engine="h5netcdf"), table)
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (["--estimator", "best"], "estimator 'best' must be one of threshold, leading_edge"),
-        (["--csv", "echoes.txt"], "--csv echoes.txt must end in .csv"),
-        (["--no-table"], "--no-table leaves nothing to do"),
-    ],
+@each_row(
+    (["--estimator", "best"], "estimator 'best' must be one of threshold, leading_edge"),
+    (["--csv", "echoes.txt"], "--csv echoes.txt must end in .csv"),
+    (["--no-table"], "--no-table leaves nothing to do"),
 )
-def test_invalid_options(tmp_path, options, sentence):
+def test_invalid_options(options, sentence, tmp_path):
     results.save(result(), tmp_path / "shot.nc")
     assert_refused(run("echoes", tmp_path / "shot.nc", *options), sentence)
 
@@ -218,31 +201,26 @@ def drop(name):
     return shot
 
 
-@each_row(
-    ("dataset", "options", "sentence"),
-    [
-        (result().transpose("time", "pixel"), {}, r"waveform has the dimensions \('time', 'pixel'\)"),
-        (result().drop_vars("pixel"), {}, "the dataset has no coordinate pixel"),
-        (result().drop_vars("time"), {}, "the dataset has no coordinate time"),
-        (result().drop_vars("waveform"), {}, "must have waveforms over time or signals of a receiver"),
-        (drop("altitude"), {}, "the dataset has no attribute altitude"),
-        (drop("pulse_fwhm_ns"), {}, "the dataset has no attribute pulse_fwhm_ns"),
-        *(
-            (result(**{name: np.nan}), {}, f"the attribute {name} = nan of the dataset must be a number")
-            for name in ("divergence_mrad", "field_of_view_mrad", "response_time_ns", "wavelength_nm")
-        ),
-        (result(np.full((1, BINS), np.nan)), {}, "waveform holds values that are not finite"),
-        (result(), {"estimators": "best"}, "estimator 'best' must be one of"),
-        (result(), {"estimators": []}, "estimator '' must be one of"),
-        (result(), {"threshold": -1.0}, "threshold = -1 must be greater than 0"),
-        (result(), {"layers": 20}, "layers = 20 must lie between 0 and 8"),
-        (result(), {"block": 0}, "block = 0 must lie between 1"),
-        (result(), {"depth_from": "top"}, "depth_from = 'top' must be 'echo' or 'mean'"),
-        (result(), {"noise": [1.0, 2.0]}, r"noise of shape \(2,\) must be a number"),
-        (recorded(np.stack([waveform()]), 2, 0.1).isel(time=slice(60, None)), {}, "at least 4 bins before"),
-    ],
+@refuses(
+    (result().transpose("time", "pixel"), {}, r"waveform has the dimensions \('time', 'pixel'\)"),
+    (result().drop_vars("pixel"), {}, "the dataset has no coordinate pixel"),
+    (result().drop_vars("time"), {}, "the dataset has no coordinate time"),
+    (result().drop_vars("waveform"), {}, "must have waveforms over time or signals of a receiver"),
+    (drop("altitude"), {}, "the dataset has no attribute altitude"),
+    (drop("pulse_fwhm_ns"), {}, "the dataset has no attribute pulse_fwhm_ns"),
+    *(
+        (result(**{name: np.nan}), {}, f"the attribute {name} = nan of the dataset must be a number")
+        for name in ("divergence_mrad", "field_of_view_mrad", "response_time_ns", "wavelength_nm")
+    ),
+    (result(np.full((1, BINS), np.nan)), {}, "waveform holds values that are not finite"),
+    (result(), {"estimators": "best"}, "estimator 'best' must be one of"),
+    (result(), {"estimators": []}, "estimator '' must be one of"),
+    (result(), {"threshold": -1.0}, "threshold = -1 must be greater than 0"),
+    (result(), {"layers": 20}, "layers = 20 must lie between 0 and 8"),
+    (result(), {"block": 0}, "block = 0 must lie between 1"),
+    (result(), {"depth_from": "top"}, "depth_from = 'top' must be 'echo' or 'mean'"),
+    (result(), {"noise": [1.0, 2.0]}, r"noise of shape \(2,\) must be a number"),
+    (recorded(np.stack([waveform()]), 2, 0.1).isel(time=slice(60, None)), {}, "at least 4 bins before"),
 )
-def test_invalid_input(dataset, options, sentence):
-    with pytest.raises(UserError, match=sentence) as refused:
-        echo_table.extract(dataset, **options)
-    assert "\n" not in str(refused.value)
+def test_invalid_input(dataset, options):
+    echo_table.extract(dataset, **options)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from rows import each_row
+from rows import each_row, must_refuse
 from scipy.stats import exponnorm, norm
 
 from mitransient_lidar import results
@@ -72,7 +72,7 @@ def heights(table):
     return (SURFACE - time) * C / 2, table["surface_time_ns_stderr"].values[:, 0] * C / 2
 
 
-@each_row("height", (-0.2, 0.0, 0.25))
+@each_row(-0.2, 0.0, 0.25)
 def test_the_surface_is_found_without_noise(height):
     """Of glint, of both, and of the water's light alone, which comes 4.7 cm of air later: no column, no bottom."""
     powers = [echo(height, *light) for light in ((0.1, 0.003), (1e-5, 0.003), (0.0, 0.003), (0.0, 0.02))]
@@ -134,5 +134,4 @@ def test_corrections_of_another_surface_are_refused():
         UserError, match="from green light, but depths count from infrared light: take one of depth-bias"
     ):
         check_surface(green, infrared=True)
-    with pytest.raises(UserError, match="from infrared light, but depths count from green light"):
-        check_surface(infrared, infrared=False)
+    must_refuse("from infrared light, but depths count from green light", check_surface, infrared, infrared=False)

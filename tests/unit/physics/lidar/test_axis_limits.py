@@ -1,14 +1,14 @@
-"""Limits of time axes that fit by themselves, against closed forms of single paths."""
+"""Automatic time axes against geometry, and the system attenuation of Gordon (1982)."""
 
 import math
 
 import numpy as np
 import pytest
 from oracles.refracted_path import refracted_path
-from rows import each_row
+from rows import each_row, must_refuse
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.axis_limits import Cone, LidarView, Solid
+from mitransient_lidar.physics.lidar.axis_limits import Cone, LidarView, Solid, system_attenuation
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -52,7 +52,7 @@ def test_first_light_comes_from_a_crest_at_the_near_edge(off_nadir_deg, crest):
     assert found.first_ns == pytest.approx(2 * NS * (200 - crest) / math.cos(max(edge, 0.0)), rel=1e-6)
 
 
-@each_row(("view", "beam"), [(15.0, 500.0), (500.0, 15.0), (15.0, 15.0)])
+@each_row((15.0, 500.0), (500.0, 15.0), (15.0, 15.0))
 def test_light_is_that_of_directions_in_view_and_beam(view, beam):
     found = lidar(cone(45.0, view), cone(45.0, beam)).limits([plane(1.0)])
     for time, side in zip(found.surface_ns, (-1, 1), strict=True):
@@ -150,7 +150,7 @@ def test_the_column_falls_through_layers():
     assert water(0.0)[1].depth_of(10.0) == 0.0
 
 
-@each_row(("attenuation", "is_seen"), [(0.2, True), (0.5, False)])
+@each_row((0.2, True), (0.5, False))
 def test_an_invisible_bottom(attenuation, is_seen):
     found = lidar(cone(0.0), cone(0.0, 25.0), water(attenuation)).limits([plane(40.0)])
     assert ("bottom" in found.end) == is_seen
@@ -182,13 +182,10 @@ def test_a_square_view_reaches_its_corners():
 
 
 @each_row(
-    ("first", "last", "width", "start", "count"),
-    [
-        (1396.2, 1552.0, 1.0, 1395.0, 160),
-        (-7.0, 33.0, 0.5, -7.0, 80),
-        (1396.2, 1552.0, 0.3, 1392.0, 540),
-        (3.33562e6, 3.33577e6, 1.0, 3335620.0, 150),
-    ],
+    (1396.2, 1552.0, 1.0, 1395.0, 160),
+    (-7.0, 33.0, 0.5, -7.0, 80),
+    (1396.2, 1552.0, 0.3, 1392.0, 540),
+    (3.33562e6, 3.33577e6, 1.0, 3335620.0, 150),
 )
 def test_start_and_number_of_bins_are_readable(first, last, width, start, count):
     axis = TimeAxis.covering(first, last, width)
@@ -201,3 +198,15 @@ def test_a_given_number_wins():
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, start_ns=1380.3) == TimeAxis(1380.3, 1.0, 175)
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, bin_count=40) == TimeAxis(1395.0, 1.0, 40)
     assert TimeAxis.covering(1396.2, 1552.0, 1.0, start_ns=2000.0).bin_count == 5
+
+
+@each_row(
+    (0.3, 0.17, 0.0, 0.3, 1e-15),
+    # Gordon: Kd beyond c R of 5 to 6. Here c R = 5, D = 2 R: exp(-8.5) = 2.0e-4 of c - Kd is left.
+    (0.5, 0.1, 20.0, 0.1 + 0.4 * 2.035e-4, 1e-6),
+    # c D = 1: exp(-0.85) = 0.42741; with the radius in place of the diameter it would be exp(-0.425) = 0.65377.
+    (0.25, 0.05, 4.0, 0.05 + 0.2 * 0.42741, 1e-5),
+)
+def test_from_c_for_narrow_spots_to_kd_for_wide_ones(attenuation, kd, spot, expected, tolerance):
+    assert system_attenuation(attenuation, kd, spot) == pytest.approx(expected, rel=tolerance)
+    must_refuse(r"kd = 0\.6 must not exceed attenuation = ", system_attenuation, attenuation, [0.05, 0.6], 1)

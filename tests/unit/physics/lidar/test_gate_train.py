@@ -1,12 +1,13 @@
-"""Gates: shapes, trains and weights of echoes."""
+"""Gates: their shapes, trains and sequences, and what they collect of bins."""
 
 import numpy as np
 import pytest
 from oracles.gates import transmission
+from rows import must_refuse
 from scipy.integrate import quad
 from scipy.stats import exponnorm, norm
 
-from mitransient_lidar.physics.lidar.gate_train import GateShape, GateTrain
+from mitransient_lidar.physics.lidar.gate_train import GateSequence, GateShape, GateTrain
 from mitransient_lidar.physics.lidar.pulse import Pulse
 
 PROFILE = GateShape.sampled([100, 101, 103, 104, 107], [0, 0.8, 0.8, 0.4, 0])
@@ -75,8 +76,7 @@ def test_profile_files(tmp_path):
     path.write_text("gate [%]; t [ps]\n0; 0\n100; 1000\n0; 3000\n")
     assert GateShape.from_file(path).width_ns == pytest.approx(1.5)
     path.write_text("1 2 3\n4 5 6\n")
-    with pytest.raises(ValueError, match="line 1: '1 2 3' must be two numbers, time in ns and transmission"):
-        GateShape.from_file(path)
+    must_refuse("line 1: '1 2 3' must be two numbers, time in ns and transmission", GateShape.from_file, path)
 
 
 @pytest.mark.parametrize("shape", [GateShape.edges(7.0), GateShape.edges(7.0, 2.0, 6.0), PROFILE])
@@ -101,8 +101,7 @@ def test_gates_follow_each_other():
         first, weights = train.gate_bins(gate, 1390.0, 0.5, 100)
         assert first == train.gate_bins(0, 1390.0, 0.5, 100)[0] + 5 * gate
         np.testing.assert_allclose(weights, train.gate_bins(0, 1390.0, 0.5, 100)[1], atol=1e-12)
-    with pytest.raises(ValueError, match="gate = 5 must lie between 0 and 4"):
-        train.gate_bins(5, 1390.0, 0.5, 100)
+    must_refuse("gate = 5 must lie between 0 and 4", train.gate_bins, 5, 1390.0, 0.5, 100)
 
 
 @pytest.mark.parametrize("train", [GateTrain(1403.2, 7.0, 3.3, 4, 2.0, 4.0), GateTrain.measured(PROFILE, 1402, 1.7, 6)])
@@ -129,7 +128,6 @@ def test_weights_of_sharp_gates_are_shares_of_bins():
 
 
 def weights_at(table, time_ns):
-    """Return weights of a response table at arrival times [ns]."""
     return np.interp(time_ns, table.start_ns + table.step_ns * np.arange(table.values.size), table.values)
 
 
@@ -168,3 +166,42 @@ def test_response_of_a_gate_with_edges_agrees_with_quadrature():
 def test_a_long_response_of_a_short_pulse_has_a_step_that_fits():
     train = GateTrain(1400.0, 8.0, 4.0, 3)
     assert train.response_weights(Pulse.gaussian(0.01), 50.0).values.size <= 2**18
+
+
+GATES, PULSES, FRAMES = 5, 3, 4
+ALL = np.meshgrid(np.arange(FRAMES), np.arange(GATES), np.arange(PULSES), indexing="ij")
+
+
+@pytest.mark.parametrize("order", ["in_order", "interleaved", "random"])
+def test_each_pulse_of_the_laser_belongs_to_one_image(order):
+    sequence = GateSequence(GATES, PULSES, FRAMES, 100.0, order, seed=3)
+    times = sequence.times(*ALL)
+    np.testing.assert_allclose(np.sort(times, axis=None), np.arange(times.size) / 100.0, atol=1e-12)
+    # Frame after frame.
+    assert np.all(times[:-1].max(axis=(1, 2)) < times[1:].min(axis=(1, 2)))
+    # Pulses of an image follow each other, or those of all other gates come between.
+    apart = GATES if order == "interleaved" else 1
+    np.testing.assert_allclose(np.diff(times, axis=2), apart / 100.0)
+    in_turn = np.all(np.diff(times[:, :, 0], axis=1) > 0, axis=1)
+    assert not in_turn.all() if order == "random" else in_turn.all()
+    later = GateSequence(GATES, PULSES, FRAMES, 100.0, order, readout_s=0.5, seed=3).times(*ALL) - times
+    readouts = ALL[0] if order == "interleaved" else ALL[0] * GATES + sequence.places[ALL[0], ALL[1]]
+    np.testing.assert_allclose(later, 0.5 * readouts)
+
+
+@pytest.mark.parametrize(("pulses", "passes"), [(1, 4), (5, 3), (7, 2), (2, 16)])
+def test_passes_sample_all_pulses_alike(pulses, passes):
+    """Over even numbers in [0, 1), every pulse is in the same share of all passes."""
+    sequence, even = GateSequence(1, pulses, 1, 1.0), (np.arange(7000) + 0.5) / 7000
+    drawn = np.concatenate([sequence.sampled_pulse(number, passes, even) for number in range(passes)])
+    share = np.bincount(drawn, minlength=pulses) / drawn.size
+    assert share == pytest.approx(1 / pulses, abs=1 / 7000)
+    # Each pass has its own part of the pulses.
+    spans = [np.ptp(sequence.sampled_pulse(number, passes, even)) for number in range(passes)]
+    assert max(spans) <= pulses / passes + 1
+
+
+def test_platform_goes_along_its_heading():
+    sequence = GateSequence(1, 1, 1, 1.0, speed=2.0, heading_deg=90.0)
+    np.testing.assert_allclose(sequence.displacements(np.array([0.0, 3.0])), [[0, 0], [6, 0]], atol=1e-12)
+    must_refuse("pulse_rate_hz = 0 must be greater than 0", GateSequence, 1, 1, 1, 0.0)

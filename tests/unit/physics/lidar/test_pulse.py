@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse
 from scipy.integrate import quad
 from scipy.stats import exponnorm, norm
 
@@ -33,8 +33,7 @@ def test_sampled_pulse_is_shifted_and_normalised():
 
 
 @each_row(
-    ("times", "power", "width"),
-    [([10, 11, 14], [0, 6, 0], 2.0), ([0, 4], [1, 1], 4.0), ([0, 4], [0, 1], 2.0), ([0, 1, 3, 4], [0, 1, 1, 0], 3.0)],
+    ([10, 11, 14], [0, 6, 0], 2.0), ([0, 4], [1, 1], 4.0), ([0, 4], [0, 1], 2.0), ([0, 1, 3, 4], [0, 1, 1, 0], 3.0)
 )
 def test_width_of_few_samples(times, power, width):
     """Half of the maximum is crossed between samples: samples above it alone would give 0 and 2 ns."""
@@ -50,13 +49,12 @@ def test_pulse_file_of_an_oscilloscope(tmp_path, caplog):
     np.testing.assert_allclose(pulse.power, [0, 0, 0.5, 0], rtol=1e-12)
     assert caplog.messages == [f"{path}: 1 of 4 samples are below 0, down to -0.013 of the largest one, and set to 0"]
     path.write_text("ns, V\n0, 0\n1, -1\n2, 0.1\n")
-    with pytest.raises(ValueError, match=r"pulse.txt has power = -1 with a largest one of 0.1: samples must not be"):
-        Pulse.from_file(path)
+    must_refuse(r"pulse.txt has power = -1 with a largest one of 0.1: samples must not be", Pulse.from_file, path)
 
 
-@each_row("bin_width", [0.1, 0.5, 5.0, 200.0])
-@each_row("response", [0.0, 1e-4, 2.0, 50.0])
-def test_gaussian_kernel(bin_width, response):
+@each_row(0.1, 0.5, 5.0, 200.0)
+@each_row(0.0, 1e-4, 2.0, 50.0)
+def test_gaussian_kernel(response, bin_width):
     first, weights = Pulse.gaussian(5.0).kernel(bin_width, response)
     assert isinstance(first, int)
     assert weights.sum() == pytest.approx(1, abs=1e-12)
@@ -118,7 +116,7 @@ def test_waveform_matches_direct_sum_within_the_record(longest_direct, monkeypat
     np.testing.assert_array_equal(waveform(energy, 2.0, (25, np.ones(3))), 0)
 
 
-@each_row("sign", [1.0, -1.0])
+@each_row(1.0, -1.0)
 def test_transforms_light_no_bins_that_no_energy_reaches(sign, monkeypatch):
     """Rounding of the largest power would be light before the surface that is the same in each pass."""
     monkeypatch.setattr(pulse, "_LONGEST_DIRECT", 0)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rows import each_row, must_refuse
 from significance import largest_chi2, largest_z, variance_limits
 
 from mitransient_lidar.core.errors import UserError
@@ -61,18 +62,14 @@ def test_frames_have_the_moments_of_the_closed_form(name: str, share: float) -> 
     assert np.abs(scores).max() < largest_z(GATES, 3), scores
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"quantum_efficiency": 1.03},
-        {"wavelength_nm": 1.03},
-        {"gain": 1.03},
-        {"excess_noise": 1.15},
-        {"read_noise": 20.0},
-        {"intensifier_mtf": 1.3},
-        {"pulses": 1.2},
-    ],
-    ids=lambda wrong: next(iter(wrong)),
+@each_row(
+    {"quantum_efficiency": 1.03},
+    {"wavelength_nm": 1.03},
+    {"gain": 1.03},
+    {"excess_noise": 1.15},
+    {"read_noise": 20.0},
+    {"intensifier_mtf": 1.3},
+    {"pulses": 1.2},
 )
 def test_a_wrong_factor_would_be_found(wrong: dict[str, float]) -> None:
     one, (name, factor) = CAMERAS["iccd"], *wrong.items()
@@ -170,17 +167,14 @@ def test_a_file_changes_a_camera(tmp_path) -> None:
     assert all(one.source and "assumed" in one.source for one in CAMERAS.values())
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('[camera]\nkind = "direct"', "no quantum_efficiency"),
-        ('preset = "iccd"\n[camera]\nbit = 3', "'bit' is no key"),
-        ('preset = "iccd"\n[camera]\ngain = 0.5', "gain = 0.5 must be at least 1"),
-        ('preset = "pmt"\n[camera]\ngain = 2', "preset = 'pmt' must be one of iccd"),
-        ('preset = "spad_camera"\n[camera]\nread_noise = 3', "read_noise = 3 is no parameter of a camera of kind"),
-        ('preset = "iccd"\n[camera]\noffset_dn = 5', "offset_dn = 5 must be at least 20"),
-        ('preset = "iccd"\n[camera]\nexcess_noise = 1', "excess_noise = 1 must be at least .* = 1.005"),
-    ],
+@each_row(
+    ('[camera]\nkind = "direct"', "no quantum_efficiency"),
+    ('preset = "iccd"\n[camera]\nbit = 3', "'bit' is no key"),
+    ('preset = "iccd"\n[camera]\ngain = 0.5', "gain = 0.5 must be at least 1"),
+    ('preset = "pmt"\n[camera]\ngain = 2', "preset = 'pmt' must be one of iccd"),
+    ('preset = "spad_camera"\n[camera]\nread_noise = 3', "read_noise = 3 is no parameter of a camera of kind"),
+    ('preset = "iccd"\n[camera]\noffset_dn = 5', "offset_dn = 5 must be at least 20"),
+    ('preset = "iccd"\n[camera]\nexcess_noise = 1', "excess_noise = 1 must be at least .* = 1.005"),
 )
 def test_files_are_refused_in_a_sentence(text: str, message: str, tmp_path) -> None:
     path = tmp_path / "own.toml"
@@ -191,7 +185,5 @@ def test_files_are_refused_in_a_sentence(text: str, message: str, tmp_path) -> N
 
 
 def test_each_kind_of_receiver_names_the_other() -> None:
-    with pytest.raises(UserError, match=r"'iccd' is a camera, which records gates: .* pmt"):
-        waveform_receiver("iccd")
-    with pytest.raises(UserError, match="'pmt' is one of waveforms, but gates need a camera: iccd"):
-        camera("pmt")
+    must_refuse(r"'iccd' is a camera, which records gates: .* pmt", waveform_receiver, "iccd")
+    must_refuse("'pmt' is one of waveforms, but gates need a camera: iccd", camera, "pmt")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_case, each_row
 from significance import largest_z
 
 from mitransient_lidar.physics.receiver import dead_time
@@ -50,15 +50,12 @@ def test_excess_noise_of_dynodes_against_a_cascade():
     assert_moments(electrons, 45.0, 45.0**2 * (tube.excess_noise - 1))
 
 
-@pytest.mark.parametrize(
-    ("detector", "gain", "noise", "leakage"),
-    [
-        (LinearDetector(0.5), 1.0, 1.0, 0.0),
-        (LinearDetector.avalanche(0.5, 100.0, 0.02), 100.0, 3.9502, 0.0),
-        (LinearDetector.photomultiplier(0.5, [5.0, 5.0]), 25.0, 1.24, 0.0),
-        # 1.602177 nA are 10 electrons a ns.
-        (LinearDetector(0.5, dark_current_na=1.602177, leakage_current_na=16.02177), 1.0, 1.0, 200.0),
-    ],
+@each_row(
+    (LinearDetector(0.5), 1.0, 1.0, 0.0),
+    (LinearDetector.avalanche(0.5, 100.0, 0.02), 100.0, 3.9502, 0.0),
+    (LinearDetector.photomultiplier(0.5, [5.0, 5.0]), 25.0, 1.24, 0.0),
+    # 1.602177 nA are 10 electrons a ns.
+    (LinearDetector(0.5, dark_current_na=1.602177, leakage_current_na=16.02177), 1.0, 1.0, 200.0),
 )
 def test_linear_detectors(detector, gain, noise, leakage):
     photons = np.array([[4.0, 40.0, 400.0]])
@@ -112,15 +109,12 @@ def varying_light(bins=90, peak=0.8):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "detector",
-    [
-        SinglePhotonDetector(1.0, 7.0),
-        SinglePhotonDetector(1.0, 7.5),
-        SinglePhotonDetector(1.0, 7.2, paralyzable=True),
-        SiliconPhotomultiplier(1.0, 25, 7.3),
-        SiliconPhotomultiplier(1.0, 25, 7.3, crosstalk=0.2, gain=3.0, gain_spread=0.3),
-    ],
+@each_case(
+    SinglePhotonDetector(1.0, 7.0),
+    SinglePhotonDetector(1.0, 7.5),
+    SinglePhotonDetector(1.0, 7.2, paralyzable=True),
+    SiliconPhotomultiplier(1.0, 25, 7.3),
+    SiliconPhotomultiplier(1.0, 25, 7.3, crosstalk=0.2, gain=3.0, gain_spread=0.3),
 )
 def test_geiger_detectors_against_realisations(detector):
     events = varying_light() * getattr(detector, "cells", 1)
@@ -161,9 +155,9 @@ def test_steady_counts_against_published_formula(rate, paralyzable):
     assert total == pytest.approx(variance, rel=5e-3)
 
 
-@each_row("dead_ns", [1.0, 3.0, 3.2, 3.8])
-@each_row("events", [0.01, 0.5, 1.9, 6.0])
-def test_steady_rate_is_exact_in_strong_light(dead_ns, events):
+@each_row(1.0, 3.0, 3.2, 3.8)
+@each_row(0.01, 0.5, 1.9, 6.0)
+def test_steady_rate_is_exact_in_strong_light(events, dead_ns):
     """Feller (1948). With events in the middle of their bins, 1.9 a bin would lose 3.8 and 25 % of the counts."""
     x = events * dead_ns
     light = np.full(2000, events)

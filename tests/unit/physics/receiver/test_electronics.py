@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, must_refuse
 from scipy.stats import norm
 from significance import largest_z
 
@@ -24,8 +24,8 @@ def test_low_pass_halves_the_power_at_the_bandwidth(response):
     assert delay == pytest.approx(1 / (2 * np.pi * frequency) if response == "single_pole" else 0, rel=1e-3, abs=1e-9)
 
 
-@each_row("width", [0.1, 1.0, 7.0])
-@each_row("response", ["single_pole", "gaussian"])
+@each_row(0.4, 1.0, 7.0)
+@each_row("single_pole", "gaussian")
 def test_samples_see_each_charge_once_and_in_its_time(response, width):
     """Steady light, an echo in one bin, and the bins that a sample depends on."""
     low_pass = Amplifier(1.0, bandwidth_mhz=100.0, response=response).low_pass(width)
@@ -52,8 +52,8 @@ def test_samples_see_each_charge_once_and_in_its_time(response, width):
         np.testing.assert_allclose(found, np.array(alone)[:, low_pass.start :: 2 * low_pass.parts], rtol=1e-12)
 
 
-@each_row("width", [0.1, 1.0, 4.0])
-@each_row(("response", "factor"), [("single_pole", np.pi / 2), ("gaussian", np.sqrt(np.pi / np.log(16)))])
+@each_row(0.1, 1.0, 4.0)
+@each_row(("single_pole", np.pi / 2), ("gaussian", np.sqrt(np.pi / np.log(16))))
 def test_thermal_noise_behind_the_bandwidth(response, factor, width):
     """4 k T/R times the equivalent noise bandwidth, 1.571 and 1.064 times that of half power, for bins of any width."""
     amplifier = Amplifier(50.0, load_ohm=50.0, temperature_k=300.0, bandwidth_mhz=100.0, response=response)
@@ -116,7 +116,7 @@ def test_rounding_noise():
     assert np.all(samples.var(axis=0) > sigma**2 * (1 + limit))
 
 
-@each_row("mean", [-1.5, -0.9, 0.2, 0.95, 3.0])
+@each_row(-1.5, -0.9, 0.2, 0.95, 3.0)
 def test_limits_of_the_amplifier(mean):
     # Censored normal distribution in closed form.
     sigma, a, b = 0.3, -1.0, 1.0
@@ -132,8 +132,8 @@ def test_limits_of_the_amplifier(mean):
     assert found.saturation[0] == pytest.approx(norm.cdf(low) + norm.sf(high), abs=1e-12)
 
 
-@each_row("mean", [-0.401, -2e-3, 0.0, 2e-3, 2e-2, 0.5, 0.798])
-@each_row("logarithm", [None, LogAmplifier(0.3, 1e-3)])
+@each_row(-0.401, -2e-3, 0.0, 2e-3, 2e-2, 0.5, 0.798)
+@each_row(None, LogAmplifier(0.3, 1e-3))
 def test_samples_of_noise(logarithm, mean):
     # Closed forms, or the quadrature, against quantiles of the normal distribution.
     stage = Readout(0.8, logarithm, Digitiser(16, 1.2, -0.4))
@@ -152,5 +152,4 @@ def test_samples_fall_on_bins():
     assert Digitiser(8, 1.0, sampling_ghz=0.3).stride(1 / 0.3) == 1
     with pytest.raises(ValueError, match=r"sampling_ghz = 1 must give an integer number of bins of 0.3 ns .* 3.33333"):
         Digitiser(8, 1.0, sampling_ghz=1.0).stride(0.3)
-    with pytest.raises(ValueError, match="sampling_ghz = 2"):
-        Digitiser(8, 1.0, sampling_ghz=2.0).stride(1.0)
+    must_refuse("sampling_ghz = 2", lambda: Digitiser(8, 1.0, sampling_ghz=2.0).stride(1.0))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rows import each_row, must_refuse, refuses
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
@@ -145,35 +146,29 @@ def test_atlas_counts_after_the_surface_what_it_was_seen_to_count():
     np.testing.assert_allclose(share, seen, rtol=0.07)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("gain = ", "not a TOML file"),
-        ('preset = "tube"', "preset = 'tube' must be one of"),
-        ("gain = 1", "neither a preset nor a detector"),
-        ('preset = "apd"\ncolour = 3', "'colour' is no key of own.toml: allowed are"),
-        ('preset = "apd"\n[amplifier]\nohms = 3', "'ohms' is no key of own.toml: amplifier"),
-        ('preset = "apd"\n[detector]\ntype = "eye"', "detector.type = 'eye' must be one of"),
-        ('[detector]\ntype = "photodiode"', "detector has no quantum_efficiency"),
-        ('preset = "apd"\n[amplifier]\nbandwidth_mhz = -1', "amplifier: bandwidth_mhz = -1"),
-        ('preset = "apd"\n[channels]\ndeep = 3', "channels.deep = 3 must be a table"),
-        ('preset = "apd"\n[channels.deep]\npreset = "pmt"', "'preset' is no key of own.toml: channels.deep"),
-        ('preset = "apd"\n[channels.deep.digitiser]\nbits = 8', "digitiser of channel 'deep' must be that of all"),
-        (
-            'preset = "apd"\n[channels.deep.amplifier]\nbandwidth_mhz = 8',
-            "amplifier of channel 'deep' must have the resp",
-        ),
-        ('preset = "spad"\n[amplifier]\ntransimpedance_ohm = 8', "amplifier must be None behind"),
-        ('preset = "apd"\n[amplifier]\nimpulse_response = 3', "impulse_response = 3 must be the name of a file"),
-        ('preset = "apd"\n[amplifier]\nrecovery_ns = 20', "recovery_ns = 20 needs a limit_v of the amplifier"),
-        ('preset = "apd"\n[detector]\ntail_fractions = 0.1', "detector: tail_fractions = 0.1 must be a list of num"),
-        (
-            'preset = "pmt"\n[detector]\nafterpulse_probability = 0.1',
-            "'afterpulse_probability' is no key of own.toml: detector",
-        ),
-        ('preset = "apd"\n[channels.deep.jitter]\nclock_ns = 1', "'jitter' is no key of own.toml: channels.deep"),
-        ('preset = "apd"\n[amplifier.limit_v]\nhigh = 3', "limit_v must be a value, not a table"),
-    ],
+@each_row(
+    ("gain = ", "not a TOML file"),
+    ('preset = "tube"', "preset = 'tube' must be one of"),
+    ("gain = 1", "neither a preset nor a detector"),
+    ('preset = "apd"\ncolour = 3', "'colour' is no key of own.toml: allowed are"),
+    ('preset = "apd"\n[amplifier]\nohms = 3', "'ohms' is no key of own.toml: amplifier"),
+    ('preset = "apd"\n[detector]\ntype = "eye"', "detector.type = 'eye' must be one of"),
+    ('[detector]\ntype = "photodiode"', "detector has no quantum_efficiency"),
+    ('preset = "apd"\n[amplifier]\nbandwidth_mhz = -1', "amplifier: bandwidth_mhz = -1"),
+    ('preset = "apd"\n[channels]\ndeep = 3', "channels.deep = 3 must be a table"),
+    ('preset = "apd"\n[channels.deep]\npreset = "pmt"', "'preset' is no key of own.toml: channels.deep"),
+    ('preset = "apd"\n[channels.deep.digitiser]\nbits = 8', "digitiser of channel 'deep' must be that of all"),
+    ('preset = "apd"\n[channels.deep.amplifier]\nbandwidth_mhz = 8', "amplifier of channel 'deep' must have the resp"),
+    ('preset = "spad"\n[amplifier]\ntransimpedance_ohm = 8', "amplifier must be None behind"),
+    ('preset = "apd"\n[amplifier]\nimpulse_response = 3', "impulse_response = 3 must be the name of a file"),
+    ('preset = "apd"\n[amplifier]\nrecovery_ns = 20', "recovery_ns = 20 needs a limit_v of the amplifier"),
+    ('preset = "apd"\n[detector]\ntail_fractions = 0.1', "detector: tail_fractions = 0.1 must be a list of num"),
+    (
+        'preset = "pmt"\n[detector]\nafterpulse_probability = 0.1',
+        "'afterpulse_probability' is no key of own.toml: detector",
+    ),
+    ('preset = "apd"\n[channels.deep.jitter]\nclock_ns = 1', "'jitter' is no key of own.toml: channels.deep"),
+    ('preset = "apd"\n[amplifier.limit_v]\nhigh = 3', "limit_v must be a value, not a table"),
 )
 def test_invalid_files_are_refused_in_one_sentence(text, message):
     with pytest.raises(UserError, match=message.replace("(", r"\(")) as error:
@@ -182,10 +177,8 @@ def test_invalid_files_are_refused_in_one_sentence(text, message):
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(UserError, match="receiver = 'tube' must be one of ideal"):
-        receiver("tube")
-    with pytest.raises(UserError, match="own"):
-        receiver("own.toml")
+    must_refuse("receiver = 'tube' must be one of ideal", receiver, "tube")
+    must_refuse("own", receiver, "own.toml")
 
 
 def write_response(folder, times, values):
@@ -193,18 +186,14 @@ def write_response(folder, times, values):
     (folder / "response.csv").write_text(f"time_ns,response\n{rows}\n")
 
 
-@pytest.mark.parametrize(
-    ("times", "values", "message"),
-    [
-        (np.arange(5.0) + 1, [0, 1, 2, 1, 0], "must hold 0, the arrival of the light"),
-        (np.arange(5.0), [0, 1, 2, 1, 1], "where it must be 0 within 2 %"),
-        (np.arange(5.0), [0, -1, -2, -1, 0], "must have a positive area"),
-    ],
+@refuses(
+    (np.arange(5.0) + 1, [0, 1, 2, 1, 0], "must hold 0, the arrival of the light"),
+    (np.arange(5.0), [0, 1, 2, 1, 1], "where it must be 0 within 2 %"),
+    (np.arange(5.0), [0, -1, -2, -1, 0], "must have a positive area"),
 )
-def test_responses_without_zero_are_refused(tmp_path, times, values, message):
+def test_responses_without_zero_are_refused(times, values, tmp_path):
     write_response(tmp_path, times, values)
-    with pytest.raises(UserError, match=message):
-        parse_receiver('preset = "apd"\n[amplifier]\nimpulse_response = "response.csv"', "own.toml", tmp_path)
+    parse_receiver('preset = "apd"\n[amplifier]\nimpulse_response = "response.csv"', "own.toml", tmp_path)
 
 
 def test_a_measured_single_pole_is_the_single_pole(tmp_path):

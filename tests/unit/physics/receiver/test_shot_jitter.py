@@ -31,7 +31,6 @@ def jittered(**values):
 
 
 def assert_variance(samples, variance):
-    """Compare the variance of normal samples."""
     shots = len(samples)
     assert abs(samples.var(ddof=1) / variance - 1) < largest_z(shots) * np.sqrt(2 / shots), samples.var() / variance
 
@@ -91,7 +90,7 @@ def test_seed_of_what_channels_share():
     np.testing.assert_array_equal(centroids(repeated), one)
 
 
-@each_row("bins", [-300.0, -7.25, -0.4, 0.0, 0.75, 3.0, 11.5, 300.0])
+@each_row(-300.0, -7.25, -0.4, 0.0, 0.75, 3.0, 11.5, 300.0)
 def test_delays_keep_energy_and_move_the_centroid(bins):
     light = echoes(60.0, 63.0)
     found = delayed(light, np.full((1, 2), bins))[0]

@@ -1,4 +1,4 @@
-"""Delayed events: their mean and variance against closed forms, in every function that uses a receiver."""
+"""Delayed events: tails and afterpulses against closed forms, in every function that uses a receiver."""
 
 from dataclasses import replace
 
@@ -13,6 +13,7 @@ from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import (
     LinearDetector,
     SiliconPhotomultiplier,
+    SinglePhotonDetector,
     photons_per_joule,
 )
 from mitransient_lidar.physics.receiver.receiver_files import RECEIVERS
@@ -75,7 +76,7 @@ def test_height_behind_an_echo():
     assert mean[400] * np.exp(300 / 500) / peak == pytest.approx(1e-3 * (1 + 0.5 * (2.5 / 500) ** 2), rel=1e-6)
 
 
-@each_row("name", ["ideal", "apd", "pmt_log", "sipm", "spad_array"])
+@each_row("ideal", "apd", "pmt_log", "sipm", "spad_array")
 def test_every_function_sees_the_tail(name):
     """Closed forms of records, of detection and of bounds agree on the mean; the tail is in the samples after 60 ns."""
     plain = RECEIVERS[name]
@@ -107,3 +108,53 @@ def test_afterpulses_of_cells_follow_those_that_fire():
     later = 0.05 * 1000 * (1 - np.exp(-3)) * (np.exp(-0.5 / 20) - np.exp(-1.5 / 20))
     assert events[21] == pytest.approx(later)
     assert events[21:].sum() == pytest.approx(0.05 * 1000 * (1 - np.exp(-3)) * np.exp(-0.5 / 20), rel=1e-4)
+
+
+# Dead for the rest of its bin and 9.5 bins of 1 ns: 10 bins.
+#: Dead for ten bins after a counted_flash, whose first event is a fiftieth of a bin late.
+COUNTER = SinglePhotonDetector(0.5, 9.98, afterpulse_probability=0.2, afterpulse_decay_ns=15.0)
+
+
+def counted_flash(bins):
+    events = np.zeros(bins)
+    events[0] = 50.0  # a certain count
+    return events
+
+
+def test_number_and_time_of_the_afterpulses_of_one_count():
+    """20 000 records: p / (1 - p) afterpulses of the variance p / (1 - p)^2, the first one exponentially late."""
+    shots, p, bins = 20_000, 0.2, 600
+    counts = COUNTER.sample(counted_flash(bins), 1.0, shots, np.random.default_rng(3))
+    number = counts.sum(axis=1) - 1
+    # Each count is followed by another one with the probability p: a geometric distribution.
+    mean, variance = p / (1 - p), p / (1 - p) ** 2
+    fourth = variance**2 * (9 + (1 - p) ** 2 / p)
+    limit = largest_z(shots, 2)
+    assert abs(number.mean() - mean) < limit * np.sqrt(variance / shots)
+    assert abs(number.var() - variance) < limit * np.sqrt((fourth - variance**2) / shots)
+    # No second afterpulse is within the dead time after the first possible one.
+    expected = np.where(np.arange(20) >= 10, p * (np.exp(-(np.arange(20) - 10) / 15) * -np.expm1(-1 / 15)), 0)
+    found = counts[:, :20].mean(axis=0)[1:]
+    error = np.sqrt(np.maximum(expected[1:] * (1 - expected[1:]), 1e-12) / shots)
+    assert np.max(np.abs(found - expected[1:]) / error) < largest_z(shots, 19)
+    np.testing.assert_allclose(COUNTER.moments(counted_flash(bins), 1.0, 1)[0][1:20], expected[1:], atol=1e-12)
+    assert COUNTER.moments(counted_flash(bins), 1.0, 1)[0].sum() - 1 == pytest.approx(mean, rel=1e-6)
+
+
+@pytest.mark.parametrize(("dead_ns", "channels"), [(9.5, 1), (7.3, 1)])
+def test_moments_in_changing_light(dead_ns, channels):
+    shots = 20_000
+    t = np.arange(80)
+    events = channels * (0.02 + 0.8 * np.exp(-0.5 * ((t - 12) / 2) ** 2) + 0.2 * np.exp(-0.5 * ((t - 45) / 2) ** 2))
+    counter = SinglePhotonDetector(0.5, dead_ns, channels=channels, afterpulse_probability=0.3, afterpulse_decay_ns=8.0)
+    mean, covariances = counter.moments(events, 1.0, 25)
+    counts = counter.sample(events, 1.0, shots, np.random.default_rng(4))
+    limit = largest_z(shots, 26 * 80)
+    assert np.max(np.abs(counts.mean(axis=0) - mean) / np.sqrt(covariances[0] / shots)) < limit
+    centred = counts - mean
+    for lag, covariance in enumerate(covariances):
+        products = centred[:, : len(t) - lag] * centred[:, lag:]
+        # Where both bins count together in few records, their mean is not normally distributed.
+        often = shots * (covariance + mean[: len(t) - lag] * mean[lag:]) > 100
+        error = products.std(axis=0) / np.sqrt(shots)
+        assert np.all(np.abs(products.mean(axis=0) - covariance)[often] < limit * error[often]), lag

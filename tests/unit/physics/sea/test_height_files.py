@@ -16,7 +16,7 @@ import pytest
 import rasterio
 import xarray as xr
 from array_inputs import write_bag
-from rows import each_row
+from rows import each_row, must_refuse
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.height_maps import read_height_map
@@ -79,14 +79,8 @@ def write_tif(path, content):
 
 def write_nc(path, content):
     x, y = _positions(content)
-    more = {
-        "name": "elevation",
-        "attributes": {},
-        "axis_unit": "",
-        "dims": ("y", "x"),
-        "axes": ("x", "y"),
-        **content.more,
-    }
+    more = {"name": "elevation", "attributes": {}, "axis_unit": "", "dims": ("y", "x"), "axes": ("x", "y")}
+    more |= content.more
     units = {"units": content.unit} if content.unit else {}
     axis = {"units": more["axis_unit"]} if more["axis_unit"] else {}
     x_name, y_name = more["axes"]
@@ -153,7 +147,6 @@ def with_holes(value):
 
 
 def swapped(text):
-    """Return a table with decimal commas."""
     return text.replace(".", ",")
 
 
@@ -243,11 +236,8 @@ READ = {
 }
 
 
-@each_row(
-    ("kind", "content", "options"),
-    [pytest.param(*row, id=f"{name}, {row[0]}") for name, rows in READ.items() for row in rows],
-)
-def test_heights_are_in_metres_and_positive_up(tmp_path, caplog, kind, content, options):
+@each_row(*[pytest.param(*row, id=f"{name}, {row[0]}") for name, rows in READ.items() for row in rows])
+def test_heights_are_in_metres_and_positive_up(kind, content, options, tmp_path, caplog):
     caplog.set_level(logging.INFO)
     found = read(tmp_path, kind, content, **options)
     # 32-bit formats keep seven digits; feet taken as those of US surveys would be 1e-5 m off.
@@ -335,19 +325,14 @@ REFUSED = {
 }  # fmt: skip
 
 
-@each_row(
-    ("kind", "content", "options", "message"),
-    [pytest.param(*row, id=f"{name}, {row[0]}") for name, rows in REFUSED.items() for row in rows],
-)
-def test_what_is_no_height_is_refused_in_one_sentence(tmp_path, kind, content, options, message):
+@each_row(*[pytest.param(*row, id=f"{name}, {row[0]}") for name, rows in REFUSED.items() for row in rows])
+def test_what_is_no_height_is_refused_in_one_sentence(kind, content, options, message, tmp_path):
     with pytest.raises(UserError, match=message) as error:
         read(tmp_path, kind, content, holes="fill", **options)
     assert "\n" not in str(error.value)
 
 
 @each_row(
-    ("kind", "content", "options"),
-    [
         # Declared by the file, to six digits in the cells of a header of sixteen.
         ("asc", Content(with_holes(-3.40282e38), no_data=-3.4028234663852886e38), {}),
         ("asc", Content(with_holes(-9999.0)), {}),
@@ -361,12 +346,9 @@ def test_what_is_no_height_is_refused_in_one_sentence(tmp_path, kind, content, o
         *((kind, Content(with_holes(-9999.0)), {"no_data": -9999}) for kind in WRITERS),
         *((kind, Content(with_holes(-3.4e38)), {"no_data": "-3.4e38"}) for kind in ("tif", "nc", "csv", "npz", "npy")),
         ("csv", Content(with_holes(-9999.0 * FT) / FT, more={"heading": "x_m,y_m,z_ft"}), {"no_data": -9999}),
-        ("csv", Content(more={"change": lambda text: text.replace("-5.000000000", "NA", 12)}), {}),
-    ],
-)  # fmt: skip
-def test_declared_holes_are_refused_or_filled(tmp_path, kind, content, options):
-    with pytest.raises(UserError, match="has holes, 12 of 441 heights"):
-        read(tmp_path, kind, content, **options)
+        ("csv", Content(more={"change": lambda text: text.replace("-5.000000000", "NA", 12)}), {}),)  # fmt: skip
+def test_declared_holes_are_refused_or_filled(kind, content, options, tmp_path):
+    must_refuse("has holes, 12 of 441 heights", read, tmp_path, kind, content, **options)
     found = read(tmp_path, kind, content, holes="fill", **options)
     np.testing.assert_allclose(found.heights[:, :-1], -5, rtol=0, atol=1e-6)
     assert found.filled.sum() == 12

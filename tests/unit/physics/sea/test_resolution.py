@@ -15,7 +15,6 @@ TILT = math.radians(20)
 
 
 def lidar(altitude=200.0, divergence=10e-3, field_of_view=30e-3, pixel=13e-3, aim=(0.0, 0.0), off_nadir=TILT):
-    """Return a laser and a receiver of one pose."""
     pose = aim, altitude, off_nadir
     return [
         Footprint.laser(*pose, (0.5 * divergence, 0.5 * divergence)),

@@ -68,14 +68,8 @@ def test_finer_cells_show_the_same_waves():
 
 def test_a_mean_slope_turns_the_sea_about_its_centre_and_each_place():
     """The plane is added to the waves, ends at the patch, and leaves the variance of slopes as it is."""
-    options = {
-        "wind_speed": 6.0,
-        "refined_size": 8.0,
-        "cell_size": 0.25,
-        "centre_x": 5.0,
-        "centre_y": -3.0,
-        "size": 50.0,
-    }
+    options = {"wind_speed": 6.0, "refined_size": 8.0, "cell_size": 0.25, "centre_x": 5.0, "centre_y": -3.0}
+    options |= {"size": 50.0}
     level, inclined = read(**options), read(**options, slope_x_deg=2.0, slope_y_deg=-1.0)
     added = inclined.mesh().vertices - level.mesh().vertices
     slopes = np.tan(np.radians([2.0, -1.0]))

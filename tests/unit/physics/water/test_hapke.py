@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rows import each_row
+from rows import each_row, refuses
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
@@ -22,9 +22,9 @@ def exact_h(albedo, cosine):
     return 1 / (gamma + 0.5 * albedo * np.sum(weights * x * h / (cosine + x)))
 
 
-@each_row("albedo", [0.3, 0.6, 0.9, 0.99])
-@each_row("cosine", [1.0, 0.6, 0.2])
-def test_reflectance_of_even_scattering_is_that_of_chandrasekhar(albedo, cosine):
+@each_row(0.3, 0.6, 0.9, 0.99)
+@each_row(1.0, 0.6, 0.2)
+def test_reflectance_of_even_scattering_is_that_of_chandrasekhar(cosine, albedo):
     """1 - gamma H, within the 1 % of Hapke's H function for each of two directions."""
     exact = 1 - np.sqrt(1 - albedo) * exact_h(albedo, cosine)
     surface = HapkeSurface(albedo, opposition_amplitude=0.0)
@@ -32,9 +32,9 @@ def test_reflectance_of_even_scattering_is_that_of_chandrasekhar(albedo, cosine)
     assert surface.reflectance(cosine) == pytest.approx(exact, rel=0.02)
 
 
-@each_row("surface", SURFACES)
-@each_row("cosine", [1.0, 0.7, 0.2, 0.03])
-def test_reflectance_is_the_mean_over_sampled_directions(surface, cosine):
+@each_row(*zip(SURFACES))
+@each_row(1.0, 0.7, 0.2, 0.03)
+def test_reflectance_is_the_mean_over_sampled_directions(cosine, surface):
     """Directions drawn by their cosine, against the quadrature about the peak, which is known to 0.2 %."""
     rng = np.random.default_rng(11)
     cos_out, azimuth = np.sqrt(rng.random(400_000)), 2 * np.pi * rng.random(400_000)
@@ -61,7 +61,7 @@ def test_opposition_effect_doubles_single_scattering_and_falls_to_half_its_heigh
     np.testing.assert_allclose(surge, [1.0, 0.5, 0.02 / (0.02 + np.tan(0.5))], rtol=1e-12)
 
 
-@each_row("wanted", [0.0, 0.05, 0.1, 0.43, 0.8])
+@each_row(0.0, 0.05, 0.1, 0.43, 0.8)
 def test_albedo_follows_from_the_reflectance_which_is_reciprocal(wanted):
     assert SURFACES[1].brdf(0.9, 0.3, 1.0) == pytest.approx(SURFACES[1].brdf(0.3, 0.9, 1.0), rel=1e-14)
     found = HapkeSurface(0.0, 0.3, 0.6, 0.8, 0.05).of_reflectance("reflectance", wanted)
@@ -88,15 +88,11 @@ def test_bottoms_by_name_have_the_values_of_the_table():
     assert bottom_reflectance("reflectance", "coral_sand") == pytest.approx(0.8 * 0.429 + 0.2 * 0.442)
 
 
-@each_row(
-    ("value", "wavelength", "message"),
-    [
-        ("mud", 532.0, "bottom_reflectance = 'mud' must be a number from 0 to 1, or one of coral_sand, green_algae"),
-        (1.5, 532.0, "bottom_reflectance = 1.5 must lie between 0 and 1"),
-        ("nan", 532.0, "bottom_reflectance = nan must be finite"),
-        ("coral_sand", 1064.0, "wavelength_nm = 1064 must lie between 400 and 700"),
-    ],
+@refuses(
+    ("mud", 532.0, "bottom_reflectance = 'mud' must be a number from 0 to 1, or one of coral_sand, green_algae"),
+    (1.5, 532.0, "bottom_reflectance = 1.5 must lie between 0 and 1"),
+    ("nan", 532.0, "bottom_reflectance = nan must be finite"),
+    ("coral_sand", 1064.0, "wavelength_nm = 1064 must lie between 400 and 700"),
 )
-def test_other_bottoms_are_refused(value, wavelength, message):
-    with pytest.raises(UserError, match=message):
-        bottom_reflectance("bottom_reflectance", value, wavelength)
+def test_other_bottoms_are_refused(value, wavelength):
+    bottom_reflectance("bottom_reflectance", value, wavelength)

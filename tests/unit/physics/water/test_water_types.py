@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import significance
 from oracles.diffuse_attenuation import diffuse_attenuation
-from rows import each_row
+from rows import each_case, each_row, must_refuse
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.seawater import water_absorption
 from mitransient_lidar.physics.water.water_types import (
     InherentProperties,
@@ -42,9 +41,7 @@ def test_pure_seawater_at_532_and_nothing_in_the_water():
     assert (empty.albedo, empty.backscatter_ratio, empty.kd) == (0, 0, 0)
 
 
-@each_row(
-    ("kind", "value"), [("jerlov", "9C"), ("chlorophyll", "1"), ("kd", "0.1"), ("secchi", "3"), ("petzold", "turbid")]
-)
+@each_row(("jerlov", "9C"), ("chlorophyll", "1"), ("kd", "0.1"), ("secchi", "3"), ("petzold", "turbid"))
 def test_waters_with_particles_in_the_near_infrared(kind, value):
     """Pure water absorbs; half of the particles' scattering at 532 nm is left, and 6e-4 of the dissolved matter's."""
     green, found = water_of(kind, value), water_of(kind, value, 1064.0)
@@ -58,11 +55,10 @@ def test_waters_with_particles_in_the_near_infrared(kind, value):
 
 def test_particles_of_no_molecules_stay_without():
     assert near_infrared(InherentProperties(0.15, 0.15, 0.006), 1064.0).water_scattering == 0
-    with pytest.raises(UserError, match="wavelength_nm = 690 must lie between 700 and 1100"):
-        near_infrared(jerlov("II"), 690.0)
+    must_refuse("wavelength_nm = 690 must lie between 700 and 1100", lambda: near_infrared(jerlov("II"), 690.0))
 
 
-@each_row(("water_type", "kd"), JERLOV_KD.items())
+@each_row(*JERLOV_KD.items())
 def test_jerlov_types_have_jerlovs_kd_and_agree_with_lees_formula(water_type, kd):
     """Lee, Du and Arnone (2005), which is linear in bb: too much where that is more than a tenth of a."""
     water, inverse = jerlov(water_type), from_kd(kd)
@@ -74,11 +70,8 @@ def test_jerlov_types_have_jerlovs_kd_and_agree_with_lees_formula(water_type, kd
 
 
 @each_row(
-    ("water_type", "scattering", "ratio"),
-    [
-        *(("IB", 0.124, 0.010), ("II", 0.179, 0.010), ("III", 0.290, 0.010), ("1C", 0.432, 0.0183)),
-        *(("3C", 0.651, 0.0183), ("5C", 1.21, 0.0183), ("7C", 2.49, 0.0183), ("9C", 3.31, 0.0183)),
-    ],
+    *(("IB", 0.124, 0.010), ("II", 0.179, 0.010), ("III", 0.290, 0.010), ("1C", 0.432, 0.0183)),
+    *(("3C", 0.651, 0.0183), ("5C", 1.21, 0.0183), ("7C", 2.49, 0.0183), ("9C", 3.31, 0.0183)),
 )
 def test_jerlov_types_have_the_published_properties(water_type, scattering, ratio):
     water = jerlov(water_type)
@@ -86,7 +79,7 @@ def test_jerlov_types_have_the_published_properties(water_type, scattering, rati
     assert (water.backscattering - 0.001962 / 2) / (scattering - 0.001962) == pytest.approx(ratio, rel=1e-3)
 
 
-@each_row(("concentration", "kd"), [(0.1, 0.0558), (0.3, 0.0670), (1, 0.0936), (3, 0.1457), (10, 0.2696)])
+@each_row((0.1, 0.0558), (0.3, 0.0670), (1, 0.0936), (3, 0.1457), (10, 0.2696))
 def test_chlorophyll_has_the_published_kd(concentration, kd):
     # The reference interpolates chi and e from 525 to 550 nm, the table here from 530 to 535 nm: up to 0.9 %.
     assert chlorophyll(concentration).kd == pytest.approx(kd, rel=0.01)
@@ -110,7 +103,7 @@ def test_particle_scattering():
     assert chlorophyll(5, 440).scattering - pure_seawater(440).scattering == pytest.approx(0.416 * 5**0.766, rel=1e-12)
 
 
-@each_row("kd", [0.0486, 0.05, 0.1, 0.6])
+@each_row(0.0486, 0.05, 0.1, 0.6)
 def test_water_from_kd_has_that_kd(kd):
     water = from_kd(kd)
     assert water.kd == pytest.approx(kd, rel=1e-9)
@@ -133,12 +126,13 @@ def generators():
 WATERS = [*(f"jerlov {name}" for name in ("I", "II", "III", "1C", "5C", "9C")), "chlorophyll 1", "kd 0.15", "secchi 6"]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow if "1C" in name or "kd" in name else pytest.mark.long)
-        for name in WATERS
-    ],
+@each_case(
+    *zip(
+        [
+            pytest.param(name, marks=pytest.mark.slow if "1C" in name or "kd" in name else pytest.mark.long)
+            for name in WATERS
+        ]
+    )
 )
 def test_diffuse_attenuation_by_monte_carlo(name):
     """Kd of each kind of water within the 0.6 % of the fit, in water with the functions that are rendered."""

@@ -1,14 +1,21 @@
-"""Figures and animations of gate stacks: contents, positions and colours."""
+"""Figures and animations of gate stacks and of images by daylight: contents, positions and colours."""
 
 import numpy as np
 import pytest
-from figure_inputs import stack
+from figure_inputs import frames, stack
 from PIL import Image
+from rows import must_refuse
 
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.gates.echoes import plot_depths
-from mitransient_lidar.plots.gates.images import animate_gates, colour_scale, plot_gates, reached_by_surface
+from mitransient_lidar.plots.gates.images import (
+    animate_gates,
+    animate_passive,
+    colour_scale,
+    plot_gates,
+    reached_by_surface,
+)
 
 ROWS, COLUMNS = 4, 5
 
@@ -106,23 +113,22 @@ def test_depth_map_needs_three_gates_with_depths(tmp_path):
         UserError, match=r"1 of 60 gates lie below from_depth = 5\.6 m, but a drawing of depths needs at least 3"
     ):
         plot_depths(made, tmp_path / "a.png", from_depth=5.6)
-    with pytest.raises(UserError, match="0 of 3 gates lie below the surface echo"):
-        plot_depths(make(3), tmp_path / "a.png")
-    with pytest.raises(UserError, match="no gate_depth"):
-        plot_depths(made.drop_vars("gate_depth"), tmp_path / "a.png")
+    must_refuse("0 of 3 gates lie below the surface echo", plot_depths, make(3), tmp_path / "a.png")
+    must_refuse("no gate_depth", plot_depths, made.drop_vars("gate_depth"), tmp_path / "a.png")
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
-def test_wrong_files_and_datasets(tmp_path):
-    for draw in (plot_gates, plot_depths):
-        with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):
-            draw(make(), tmp_path / "a.gif")
-        with pytest.raises(UserError, match="no gate stack"):
-            draw(make().drop_vars("gate_energy"), tmp_path / "a.png")
-    with pytest.raises(UserError, match=r"animation must end in \.gif or \.mp4"):
-        animate_gates(make(), tmp_path / "a.png")
-    with pytest.raises(UserError, match="this stack has 3 single pixels; draw its contact sheet"):
-        animate_gates(make(pixels=True), tmp_path / "a.gif")
-    with pytest.raises(UserError, match="No such file"):
-        plot_gates(make(1), tmp_path / "missing" / "a.png")
+def test_animation_shows_the_frames_in_their_time(tmp_path):
+    radiances = frames()
+    animate_passive(radiances, tmp_path / "a.gif")
+    animate_passive(radiances.isel(column=slice(None, None, -1)), tmp_path / "turned.gif")
+    assert (tmp_path / "turned.gif").read_bytes() == (tmp_path / "a.gif").read_bytes()
+    with Image.open(tmp_path / "a.gif") as movie:
+        assert (movie.n_frames, movie.info["duration"], movie.info["loop"]) == (3, 250, 0)
+        assert movie.size == (400, 320)  # 8 x 8 points a pixel, for a width of at least 384
+        shown = []
+        for index in range(3):
+            movie.seek(index)
+            shown.append(np.asarray(movie.convert("L"))[4::8, 4::8])
+    assert shown[0][1, 2] == shown[1][3, 4] == 255
+    assert np.corrcoef(shown[2].ravel(), radiances["radiance"][2].values.ravel())[0, 1] > 0.99
