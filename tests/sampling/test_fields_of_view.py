@@ -119,7 +119,7 @@ def test_overlapping_pixels_each_get_their_whole_field(caplog):
         assert abs(samples.mean() - field.area) < largest_z(COUNT, 2) * error
 
 
-@each_row(*zip(SHAPES))
+@each_row(*SHAPES)
 @each_row(0.1 * MRAD, 3 * MRAD)
 def test_no_point_of_a_field_is_out_of_its_reach(reach, name):
     """Points up to `reach` from points of the field are near it, and few of those twice as far from all of them are."""

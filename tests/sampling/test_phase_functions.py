@@ -138,7 +138,7 @@ def test_mean_cosine_and_backscatter_ratio(name):
     assert abs(np.mean(theta > np.pi / 2) - backscatter_ratio) < limit * error + 5e-6
 
 
-@each_row(*zip(PLUGINS))
+@each_row(*PLUGINS)
 def test_value_is_density_and_sampling_reports_it(name):
     plugin, _, wo, pdf = sample_angles(name, 10_000)
     value, density = plugin.eval_pdf(mi.PhaseFunctionContext(), interaction(), wo)

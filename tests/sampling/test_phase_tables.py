@@ -33,7 +33,7 @@ def value(plugin, theta):
     return np.array(plugin.eval_pdf(mi.PhaseFunctionContext(), mei, wo)[1], dtype=np.float64)
 
 
-@each_row(*zip(PLUGINS))
+@each_row(*PLUGINS)
 def test_normalised_over_the_sphere(description):
     """Quadrature in ln(theta) from 0.003 degree, plus the power law below: one half, or 4 pi, would be off by far."""
     plugin = mi.load_dict(description)

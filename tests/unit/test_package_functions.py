@@ -48,7 +48,7 @@ def gates():
     return xr.Dataset({"gate_energy": energy, "gate_energy_stderr": energy}, coords)
 
 
-@each_row(*zip(PUBLIC))
+@each_row(*PUBLIC)
 def test_every_name_is_documented(name):
     assert name in dir(mitransient_lidar)
     if name in FUNCTIONS:

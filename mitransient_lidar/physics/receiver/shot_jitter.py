@@ -40,8 +40,8 @@ class ShotJitter(Plan):
         shots instead of channels. `seed`, `common_seed`: seeds for a channel's own numbers, and for numbers that all
         channels share.
 
-        Returns `energy`, shape (shots, *records): energy over its mean. `delay_ns`, shape (shots, *records): delay of
-        the record's light [ns].
+        Returns `energy`, shape ``(shots, *records)``: energy over its mean. `delay_ns`, shape ``(shots, *records)``:
+        delay of the record's light [ns].
         """
         shared = (shots, *(size if series and axis == 0 else 1 for axis, size in enumerate(records)))
         whole = (shots, *records)

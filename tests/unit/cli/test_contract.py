@@ -170,7 +170,7 @@ def test_bad_values_are_refused_by_name(command, needed, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@each_row(*zip(FROM_FUNCTIONS))
+@each_row(*FROM_FUNCTIONS)
 def test_help_shows_ranges_and_defaults(command):
     text = " ".join(run(command, "--help").stdout.split())
     for name, (_, option, default, parameter) in options_of(command).items():

@@ -59,7 +59,7 @@ def test_every_case_has_a_scene_and_results_have_its_gates():
         np.testing.assert_allclose(found.end, expected[1:], rtol=1e-8)
 
 
-@each_row(*zip(CASES))
+@each_row(*CASES)
 def test_scene_has_the_values_of_the_table(name):
     case, root = CASES[name], ET.parse(FOLDER / "cases" / f"{name}.xml").getroot()
     receiver, surface = root.find("sensor"), root.find("shape[@type='ocean_surface']")

@@ -120,7 +120,7 @@ def test_header_links_every_script_once():
     assert len(linked) >= 20
 
 
-@each_row(*zip(SCRIPTS))
+@each_row(*SCRIPTS)
 def test_script_has_title_introduction_figure_and_conclusion(script):
     text = script.read_text(encoding="utf-8")
     module = ast.parse(text)
@@ -136,7 +136,7 @@ def test_script_has_title_introduction_figure_and_conclusion(script):
     assert re.search(r"^# \*\*What to see\.\*\* ", text, re.MULTILINE)
 
 
-@each_row(*zip(SCRIPTS))
+@each_row(*SCRIPTS)
 def test_blocks_of_text_are_comments_up_to_the_code(script):
     """A line of text that lacks its # would run as code, a title without its blank lines would be no heading."""
     for block in re.split(r"^# %%.*\n", script.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]:
@@ -146,7 +146,7 @@ def test_blocks_of_text_are_comments_up_to_the_code(script):
         assert rest.strip() or comment
 
 
-@each_row(*zip(SCRIPTS))
+@each_row(*SCRIPTS)
 def test_files_are_written_into_temporary_folders(script):
     text = script.read_text(encoding="utf-8")
     writes = re.search(r"savefig|write_text|np\.savez?|to_netcdf|\.sweep\(|\.fly\(", text)

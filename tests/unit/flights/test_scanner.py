@@ -18,7 +18,7 @@ def _azimuth_deg(axis):
     return np.degrees(np.arctan2(axis[:, 0], axis[:, 1]))
 
 
-@each_row(*zip(ALL))
+@each_row(*ALL)
 @each_row("scan", "platform")
 def test_sides_are_orthonormal(pixels, given):
     axis, far, left = Scanner.of_table({**given, "pixels": pixels}).directions(np.linspace(0, 1, 401))

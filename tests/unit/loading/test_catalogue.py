@@ -111,7 +111,7 @@ def test_parameters_are_those_of_the_reference():
     assert references.scene_parameters() == SHIPPED
 
 
-@each_row(*zip(SHIPPED))
+@each_row(*SHIPPED)
 def test_text_equals_the_file_with_its_includes(name):
     """Mitsuba reads the same plugins with the same parameters in the same order from both."""
     config = mi.parser.ParserConfig(mi.variant())

@@ -47,7 +47,7 @@ def values(name):
     return {each.name: each.value for each in catalogue.read_instrument(name).parameters if each.value}
 
 
-@each_row(*zip(NAMES))
+@each_row(*NAMES)
 def test_every_value_that_is_needed_has_a_source_or_is_assumed(name):
     instrument, given = catalogue.read_instrument(name), values(name)
     assert given.keys() >= NEEDED
@@ -66,7 +66,7 @@ def test_every_value_that_is_needed_has_a_source_or_is_assumed(name):
     assert cited == listed
 
 
-@each_row(*zip(NAMES))
+@each_row(*NAMES)
 def test_the_loaded_lidar_has_the_values_of_the_file(name):
     given = {key: float(value) for key, value in values(name).items() if key != "layout"}
     transmitter, receiver = parts(scenes.open_scene("table1", FLAT, name).scene)

@@ -84,7 +84,7 @@ def _values(plugin, folder):
     return object_values(mi.load_dict(part))
 
 
-@each_row(*zip(PLUGINS))
+@each_row(*PLUGINS)
 def test_every_declared_parameter_is_kept_with_its_default(plugin, tmp_path):
     values = _values(plugin, tmp_path)
     declared = {each.name: each for each in DECLARED[plugin] if each.name.isidentifier()}
@@ -97,7 +97,7 @@ def test_every_declared_parameter_is_kept_with_its_default(plugin, tmp_path):
     assert {name: values[name] for name in defaults} == defaults
 
 
-@each_row(*zip(PLUGINS))
+@each_row(*PLUGINS)
 def test_every_number_outside_its_range_is_refused(plugin, tmp_path, monkeypatch):
     """Below, above, and where a number has no end: the sentence names parameter and value, and what is allowed."""
     np.save(tmp_path / "image.npy", np.ones((4, 4)))
@@ -120,7 +120,7 @@ def test_every_number_outside_its_range_is_refused(plugin, tmp_path, monkeypatch
             assert f"{value:g}" in str(caught.value) or str(value) in str(caught.value)
 
 
-@each_row(*zip(PLUGINS))
+@each_row(*PLUGINS)
 def test_every_text_that_is_no_choice_is_refused(plugin):
     for each in DECLARED[plugin]:
         if each.choices:

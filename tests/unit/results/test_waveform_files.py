@@ -221,7 +221,7 @@ WRONG_LAS = {
 }
 
 
-@each_row(*zip(WRONG_LAS))
+@each_row(*WRONG_LAS)
 def test_wrong_las_files_are_refused(case, tmp_path):
     change, message = WRONG_LAS[case]
     las_with(tmp_path / "bad.las")
@@ -254,7 +254,7 @@ WRONG_PLS = {
 }
 
 
-@each_row(*zip(WRONG_PLS))
+@each_row(*WRONG_PLS)
 def test_wrong_pulse_waves_files_are_refused(case, tmp_path):
     change, message = WRONG_PLS[case]
     pls_with(tmp_path / "bad.pls")

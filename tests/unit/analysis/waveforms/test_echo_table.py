@@ -17,7 +17,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 PLACES = [[], [40], [40, 28], [44, 34, 54]]
 
 
-@each_row(*zip(echo_table.ESTIMATORS))
+@each_row(*echo_table.ESTIMATORS)
 def test_isolated_echoes_without_noise(estimator):
     """Surface and bottom of a lake without a column: times within 0.02 ns, depth within 2 mm."""
     bottom = np.array([50.0, 60.13, 70.29, 80.41])

@@ -46,7 +46,7 @@ def test_covariance_is_that_of_records(name):
     assert np.all(np.linalg.eigvalsh(moments.covariance) > -1e-12 * moments.covariance.max())
 
 
-@each_row(*zip(CHAINS))
+@each_row(*CHAINS)
 def test_derivatives_are_those_of_the_closed_forms(name):
     """The gain by more light everywhere is that between two closed forms of `expected`, for mean and variance."""
     chain, photons = CHAINS[name]

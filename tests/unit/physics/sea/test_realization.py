@@ -63,7 +63,7 @@ def test_realised_waves_have_the_variances_of_their_kind():
 
 
 @each_row((0.0, np.inf, (0, 0)), (7.3, 3.0, (0.4, -0.2)))
-@each_row(*zip(SPECTRA))
+@each_row(*SPECTRA)
 def test_coarse_realisation_is_the_low_passed_fine_one(kind, time, depth, current):
     options = {"time": time, "depth": depth, "current": current}
     fine, coarse = (realise(SPECTRA[kind], 40, cells, 9, **options) for cells in (128, 32))

@@ -215,7 +215,7 @@ def test_swell_variance_is_conserved_in_a_short_period():
     assert index[i] * index[j] > 0
 
 
-@each_row(*zip(SPECTRA))
+@each_row(*SPECTRA)
 def test_directional_spectrum_integrates_to_elevation_and_slopes(kind):
     """A direction counted clockwise, or along taken for across, changes the slopes by a fifth and more."""
     spectrum = SPECTRA[kind]

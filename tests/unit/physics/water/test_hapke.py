@@ -32,7 +32,7 @@ def test_reflectance_of_even_scattering_is_that_of_chandrasekhar(cosine, albedo)
     assert surface.reflectance(cosine) == pytest.approx(exact, rel=0.02)
 
 
-@each_row(*zip(SURFACES))
+@each_row(*SURFACES)
 @each_row(1.0, 0.7, 0.2, 0.03)
 def test_reflectance_is_the_mean_over_sampled_directions(cosine, surface):
     """Directions drawn by their cosine, against the quadrature about the peak, which is known to 0.2 %."""

@@ -44,7 +44,7 @@ def exact(column, depth, downward, length):
     return column.optical_depth(depth, np.asarray(depth) + downward * np.asarray(length), length)
 
 
-@each_row(*zip(COLUMNS))
+@each_row(*COLUMNS)
 def test_optical_depth_is_the_sum_over_the_layers(name):
     """A difference of cumulative depths over the slope would be 0/0 for level rays, and noise below a slope of 1e-3."""
     column = COLUMNS[name]
@@ -55,7 +55,7 @@ def test_optical_depth_is_the_sum_over_the_layers(name):
     assert np.all(np.abs(np.array(got) - expected) <= tolerance)
 
 
-@each_row(*zip(COLUMNS))
+@each_row(*COLUMNS)
 def test_distance_inverts_the_optical_depth(name):
     column = COLUMNS[name]
     depth, downward, wanted = rays([1e-3, 0.1, 1.0, 4.0])
@@ -125,7 +125,7 @@ def test_equal_layers_are_one():
     assert np.median(np.abs(second / first - 1)) < 1e-6
 
 
-@each_row(*zip(COLUMNS))
+@each_row(*COLUMNS)
 def test_a_layer_owns_its_upper_edge_and_the_first_one_the_crests(name):
     column = COLUMNS[name]
     flight = LayeredFlight(column)
