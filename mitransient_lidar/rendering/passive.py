@@ -106,8 +106,8 @@ def render_passive(
         Time between frames [s], greater than 0, added to the parameter ``surface_time`` of an XML scene, or to a dict's
         ``ocean_surface`` parameter ``time``.
     smooth
-        Standard deviation of a Gaussian that smooths, in each pass, the radiance of paths that the water has scattered
-        on their way to the receiver, 0.2 to 20 pixels; none by default. Reflections, and what is seen without
+        Standard deviation of a Gaussian, 0.2 to 20 pixels; none by default. In each pass it smooths the radiance of
+        paths that the water has scattered on their way to the receiver. Reflections, and what is seen without
         scattering, stay sharp. The attribute ``smoothing_bias`` estimates the relative change, rms over the pixels.
 
     Returns
@@ -116,7 +116,7 @@ def render_passive(
         ``radiance`` and ``radiance_stderr`` [W m^-2 sr^-1 nm^-1] over (row, column) or (pixel,). Several frames come
         first, over ``frame`` with its coordinate ``time_s`` [s]. A filter adds ``background_power`` [W], which the
         receiver detects without its laser. ``etendue`` [m^2 sr] is open area times pixel solid angle times the
-        transmittance of optics and (one way) air; power is radiance times etendue times filter width. The attribute
+        transmittance of optics and (one way) air. Power is radiance times etendue times filter width. The attribute
         ``background_radiance`` is the mean over the field of view. After Ctrl-C it includes the frames that were begun,
         and the attribute ``interrupted`` is 1.
 

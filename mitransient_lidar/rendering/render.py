@@ -173,7 +173,7 @@ def render(
     -----
     Standard errors come from the passes' spread. Intervals by Student's t have ``passes`` minus 1 degrees of freedom.
     Their coverage is nominal where the error is below a tenth of the value. Where it is 20 to 40 %, 95 % intervals from
-    8 passes contain the mean in 91 to 93 % of the bins; in fewer where it is larger.
+    8 passes contain the mean in 91 to 93 % of the bins. Where it is larger, fewer bins do.
     """
     derivatives = [derivatives] if isinstance(derivatives, str) else derivatives
     options = {name: value for name, value in locals().items() if name in RenderOptions.__dataclass_fields__}

@@ -146,10 +146,10 @@ class WaterEstimate:
 def water_of_column(decay: npt.ArrayLike, backscatter: npt.ArrayLike, excess: float, level: float) -> WaterEstimate:
     """Estimate absorption, backscattering, Kd and bounds of c from a column in a wide view.
 
-    The attenuation K along the path is that in the column's signal, exp(-2 K s) [1/m]. The backscatter b p(pi) includes
-    multiple scattering [1/(m sr)]: it is the power at the surface, extrapolated with K, over `LidarSystem.column_gain`
-    and the fraction of the beam in view. `excess` is K minus the absorption [1/m], and `level` the backscatter over
-    bb/(2 pi), from `scattered_light.ScatteredLight`.
+    The attenuation K along the path is that in the column's signal, exp(-2 K s) [1/m]. The backscatter b p(pi) [1/(m
+    sr)] includes multiple scattering. It is the power at the surface, extrapolated with K, over
+    `LidarSystem.column_gain` and the fraction of the beam in view. `excess` is K minus the absorption [1/m], and
+    `level` the backscatter over bb/(2 pi), from `scattered_light.ScatteredLight`.
 
     Notes
     -----
