@@ -29,7 +29,7 @@ from mitransient_lidar.rendering.passes import (
     MaxTime,
     PassLog,
     ProgressCallback,
-    SignedSeed,
+    RenderSeed,
     TargetError,
     TargetQuantile,
     Variant,
@@ -70,7 +70,7 @@ def render_passive(
         int | Sequence[int] | None,
         Option("Stop after this many passes, by default at the target error", 2, MOST_PASSES),
     ] = None,
-    seed: SignedSeed = None,
+    seed: RenderSeed = None,
     frames: Annotated[int, Option("Number of animation frames, by default 1", 1, MOST_FRAMES)] = 1,
     frame_step_s: Annotated[
         float, Option("Time between frames, by default 0.1", 0, unit="s", above=True, flag="--frame-step")
@@ -101,7 +101,7 @@ def render_passive(
         A frame's end, as for `render.render` with pixels instead of bins; by default 0.05 within 120 s. `passes` may be
         a list with one number per frame.
     seed
-        Integer from -2^63 to 2^63 - 1, 0 by default; frames and passes have independent random numbers.
+        Integer from 0 to 2^53, 0 by default; frames and passes have independent random numbers.
     frame_step_s
         Time between frames [s], greater than 0, added to the parameter ``surface_time`` of an XML scene, or to a dict's
         ``ocean_surface`` parameter ``time``.

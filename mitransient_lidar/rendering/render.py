@@ -36,7 +36,7 @@ from mitransient_lidar.rendering.passes import (
     Passes,
     ProgressCallback,
     RenderOptions,
-    SignedSeed,
+    RenderSeed,
     Smooth,
     TargetError,
     TargetQuantile,
@@ -78,7 +78,7 @@ def render(
     target_quantile: TargetQuantile = None,
     max_time: MaxTime = None,
     passes: Passes = None,
-    seed: SignedSeed = None,
+    seed: RenderSeed = None,
     max_memory: MaxMemory = None,
     pass_share: float | None = None,
     components: Components = None,
@@ -113,7 +113,7 @@ def render(
         Longest time for the passes [s], greater than 0. At least two passes are rendered; where full ones would take
         longer, with fewer paths (the attribute ``pass_share``).
     seed
-        Integer from -2^63 to 2^63 - 1, 0 by default; the same seed gives the same result on the same machine.
+        Integer from 0 to 2^53, 0 by default; the same seed gives the same result on the same machine.
     max_memory
         Memory for histograms, means and errors [GB], greater than 0; 2 by default. If a scene with gates exceeds it,
         only the gates are kept, with a warning. For images it is the whole of the process, and passes render tiles of

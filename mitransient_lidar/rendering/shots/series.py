@@ -154,7 +154,7 @@ def render_shots(
         (`transport.light_maps.renderer`). Maps serve waves, layers of one index and a bottom, without derivatives. 2
         passes are usual. Mean energies agree with merging to within 1 %, bottom times to within 0.05 ns.
     first_seed
-        Seed of the first shot, 0 to 2^40; shot n is rendered with this seed plus n.
+        Seed of the first shot, 0 to 2^53; shot n is rendered with this seed plus n.
     axis
         Time bins instead of automatic ones, which contain all shots' light. They must contain it, too, up to a
         twentieth of the record.
@@ -207,7 +207,7 @@ def render_shots(
         usual = 2 if wanted is None else MOST_PASSES_FOR_ERROR, 1.0
     passes = usual[0] if passes is None else passes
     share = options.pass_share or usual[1]
-    first_seed = integer("first_seed", first_seed, 0, 2**40)
+    first_seed = integer("first_seed", first_seed, 0, 2**53)
     given = None if positions is None else _checked_places(positions)
     variants.leave_the_gpu("shots are rendered")
     source: dict[str, Any] = {"instrument": instrument, "sensor": sensor}
