@@ -23,7 +23,8 @@ from mitransient_lidar.core.options import Option, declared
 from mitransient_lidar.core.validation import finite, number_list
 
 Define = Annotated[
-    list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter. Repeatable.")
+    list[str] | None,
+    typer.Option("-D", "--define", metavar="NAME=VALUE", help="Set a scene parameter. Repeatable."),
 ]
 DrawingOnly = Annotated[Path | None, Option("PNG, PDF or SVG file to write")]
 #: Default folder for rendered files.
@@ -321,7 +322,7 @@ def _typer(name: str, option: Option, default: Any) -> Any:
     return typer.Option(
         *(["-o"] if given == "--output" else []),
         given if default is not True else f"{given}/--no-{given.removeprefix('--')}",
-        metavar=option.form or None,
+        metavar=option.form or ("DIR" if option.meaning.startswith("Folder") else None),
         help=option.help(),
     )
 

@@ -151,13 +151,16 @@ def test_comparison_of_a_result_with_itself(result):
     done = run("compare", result, result)
     assert done.exit_code == 0, done.stderr
     found = json.loads(run("compare", result, result, "--json").stdout)
-    assert found["agrees"] and found["energy_ratio"] == 1 and f"{found['bin_count']} bins" in done.stdout
+    assert found["agrees"]
+    assert found["energy_ratio"] == 1
+    assert f"{found['bin_count']} bins" in done.stdout
     assert json.loads(run("info", result, "--json").stdout)["passes"] == mitransient_lidar.open(result).attrs["passes"]
 
 
 def test_facts_for_programs():
     facts = json.loads(run("scenes", "instruments", "riegl_vq840g", "--json").stdout)
-    assert facts["parameters"]["wavelength_nm"]["value"] == "532" and facts["channels"]
+    assert facts["parameters"]["wavelength_nm"]["value"] == "532"
+    assert facts["channels"]
     assert facts["title"] == json.loads(run("scenes", "instruments", "--json").stdout)["riegl_vq840g"]
     assert json.loads(run("info", "--json").stdout)["mitransient-lidar"] == mitransient_lidar.__version__
 
