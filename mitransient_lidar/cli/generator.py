@@ -66,13 +66,13 @@ def waveform_selection(
     given = {"--waveforms": waveforms, "--channel": channel, "--lidar": lidar}
     if file.suffix.lower() not in (".las", ".laz", ".pls", ".wvs"):
         if named := [name for name, value in given.items() if value]:
-            raise UserError(f"{named[0]} is for LAS, LAZ and PulseWaves files, and {file} is none.")
+            raise UserError(f"{named[0]} is for LAS, LAZ and PulseWaves files, and {file} is none")
         return {}
     limits = None
     if waveforms is not None:
         ends = [end.strip() for end in waveforms.split(":")]
         if len(ends) != 2 or not all(end.isdecimal() or not end for end in ends):
-            raise UserError(f"--waveforms {waveforms} is not of the form FIRST:END.")
+            raise UserError(f"--waveforms {waveforms} is not of the form FIRST:END")
         limits = int(ends[0] or 0), int(ends[1]) if ends[1] else None
     known = dict(name_and_value("--lidar", text) for text in lidar or [])
     return {"waveforms": limits, "channel": channel, "lidar": known}

@@ -80,9 +80,9 @@ def _view(
         selection = {}
     if is_scene := names_scene(file) or is_points:
         for option in [name for name, given in {**others, "--shot": shot is not None}.items() if given]:
-            raise UserError(f"{option} needs a result: {file} is a scene or points.")
+            raise UserError(f"{option} needs a result: {file} is a scene or points")
     if define and not names_scene(file):
-        raise UserError(f"-D needs a scene: {file} is none.")
+        raise UserError(f"-D needs a scene: {file} is none")
     if is_scene or (not any(others.values()) and is_page):
         _show(file, output, shot, browser, define, quiet, selection)
         return

@@ -114,7 +114,7 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> PlatformPoses:
         check_size(path, size, _LARGEST_SBET)
         data = None if size % width else np.fromfile(file, dtype="<f8").reshape(-1, _SBET_NUMBERS)
     if data is None:
-        raise UserError(f"{path} has {size} bytes, but an SBET file must have a multiple of {width}.")
+        raise UserError(f"{path} has {size} bytes, but an SBET file must have a multiple of {width}")
 
     def place(row: int) -> str:
         return f"{path}, record {row + 1}"
