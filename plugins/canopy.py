@@ -34,8 +34,8 @@ class CanopyShape(mi.Mesh):
     same gaps. The direct bottom echo is thus weakened by :math:`P`, not :math:`P^2`, unless sea ripples part the paths
     of light and view by a gap's width.
 
-    In a scene with plants, ``lidar_merging`` connects the solids to the laser instead of merging light on them (its
-    parameter ``solids``). Gaps then stay open for both ways.
+    So that gaps stay open for both, ``lidar_merging`` connects the solids in a scene with plants to the laser, instead
+    of merging light on them (its parameter ``solids``).
 
     Plants stand in a square, on the level ``depth``, or on a ``seabed`` to which a reference is nested, as
     ``<ref id="bottom"/>`` in the scene ``seagrass``.

@@ -172,8 +172,6 @@ SceneOrResult = Annotated[
     ),
 ]
 Seed = Annotated[int, Option("Random seed", 0, 2**53)]
-#: Seed of a study that makes one for each sea and pulse from it.
-SeaSeed = Annotated[int, Option("Random seed", 0, 2**31)]
 FewerPasses = Annotated[float | None, positive_option("Stop before this many seconds, with fewer passes")]
 TargetId = Annotated[str, Option("Id of the target's shape")]
 BackgroundPower = Annotated[float, Option("Daylight power on each pixel", 0, unit="W")]

@@ -44,7 +44,7 @@ MaxTime = Annotated[
 Passes = Annotated[
     int | None, Option("Stop after this many independent passes, by default at the target error", 2, MOST_PASSES)
 ]
-RenderSeed = Annotated[int | None, Option("Random seed, by default 0", 0, 2**53)]
+SignedSeed = Annotated[int | None, Option("Random seed, by default 0", 0, 2**53)]
 PassShare = Annotated[float | None, Option("Share of a full pass's paths in each pass", SMALLEST_SHARE, 1)]
 MaxMemory = Annotated[
     float | None, positive_option("Memory for histograms [GB], by default 2; with less, only gates are kept")
@@ -105,7 +105,7 @@ class RenderOptions:
     target_quantile: TargetQuantile = None
     max_time: MaxTime = None
     passes: Passes = None
-    seed: RenderSeed = None
+    seed: SignedSeed = None
     pass_share: PassShare = None
     max_memory: MaxMemory = None
     components: Components = None
@@ -315,7 +315,7 @@ def run_passes(
     goal
         Render end.
     seed
-        Render seed, 0 to 2^53.
+        Render seed, a 64-bit integer with a sign.
     errors
         Returns the relative standard errors, an array with any size; called from the second pass on.
     errors_of
@@ -430,7 +430,7 @@ def _pace(ends: list[float]) -> float:
 
 def pass_seed(seed: int, number: int) -> int:
     """Return a pass seed, different from any other pass seed with any other seed."""
-    sequence = np.random.SeedSequence([int(seed), number])
+    sequence = np.random.SeedSequence([int(seed) & 0xFFFFFFFFFFFFFFFF, number])
     return int(sequence.generate_state(1, np.uint64)[0])
 
 

@@ -29,7 +29,7 @@ from mitransient_lidar.rendering.passes import (
     MaxTime,
     PassLog,
     ProgressCallback,
-    RenderSeed,
+    SignedSeed,
     TargetError,
     TargetQuantile,
     Variant,
@@ -70,7 +70,7 @@ def render_passive(
         int | Sequence[int] | None,
         Option("Stop after this many passes, by default at the target error", 2, MOST_PASSES),
     ] = None,
-    seed: RenderSeed = None,
+    seed: SignedSeed = None,
     frames: Annotated[int, Option("Number of animation frames, by default 1", 1, MOST_FRAMES)] = 1,
     frame_step_s: Annotated[
         float, Option("Time between frames, by default 0.1", 0, unit="s", above=True, flag="--frame-step")

@@ -26,7 +26,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, has_e
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
 from mitransient_lidar.analysis.waveforms.surface_times import check_surface
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import RECEIVERS, Infrared, Numbers, Option, SeaSeed, checked, positive_option
+from mitransient_lidar.core.options import RECEIVERS, Infrared, Numbers, Option, checked, positive_option
 from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, finite
@@ -60,6 +60,7 @@ Records = Annotated[int, Option("Records with noise at each location", 1, 10_000
 SeaTime = Annotated[
     float | None, positive_option("Render no sea after this many seconds; omitted seas are NaN in the table")
 ]
+SeaSeed = Annotated[int, Option("Random seed", 0, 2**31)]
 
 #: Wavelength in their tables [nm].
 _WAVELENGTH = 532.0

@@ -35,7 +35,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import checked_path
 from mitransient_lidar.core.formats.array_files import readable_suffix
 from mitransient_lidar.core.maps import read_geotiff, write_geotiff
-from mitransient_lidar.core.options import Option, SeaSeed, checked
+from mitransient_lidar.core.options import Option, checked
 from mitransient_lidar.core.parameters.fields import is_green
 from mitransient_lidar.core.tables.written import table_lines
 from mitransient_lidar.core.validation import FloatArray, positive
@@ -62,6 +62,7 @@ from mitransient_lidar.studies.depth_bias import (
     PositionError,
     Records,
     SeaScene,
+    SeaSeed,
     rms_slopes,
 )
 from mitransient_lidar.transport.light_maps.suitability import reach_of_scattering

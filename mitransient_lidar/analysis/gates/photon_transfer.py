@@ -31,9 +31,9 @@ class PhotonTransfer(NamedTuple):
 def photon_transfer(recorded: xr.Dataset, levels: int = 20) -> PhotonTransfer:
     """Return the photon transfer of frames from `analysis.receiver.detect_waveforms`, without saturated pixels.
 
-    Pixels are sorted into levels by their mean in the first half of the frames. Means and variances come from the
-    second half, as sorting would bias the first. The relation is a line where each pixel has its own light. An
-    intensifier needs light that changes little over its blur, and a photon counter few counts.
+    Pixels are sorted into levels by their mean in the first half of the frames; means and variances come from the
+    second half, as sorting would bias the first. The relation is a line where each pixel has its own light: with an
+    intensifier, for light that changes little over its blur; in a photon counter, for few counts.
 
     Frames have ``signal``, ``saturation`` and ``dark_level``; there are 2 to 1000 levels, each with as many pixels and
     gates. Raises `UserError` for fewer than 4 frames, or 2 pixels and gates a level that are not saturated.

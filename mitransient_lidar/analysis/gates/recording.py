@@ -35,10 +35,10 @@ def record_gates(
 
     Notes
     -----
-    Gate jitter needs the energy in shifted gates. It comes from waveforms in the same dataset. Else it comes from the
-    gates before and after one, if they follow within the longer of the pulse and the gate's edges. With neither, it is
-    left out, and a warning reports it. The mean of a stack that was rendered with jitter has it already. The standard
-    errors of the mean assume one sign for all pixel errors.
+    Gate jitter needs the energy in shifted gates. It comes from waveforms in the same dataset, or else from the gates
+    before and after one if they follow within the longer of the pulse and the gate's edges. With neither, it is left
+    out, and a warning reports it. The mean of a stack that was rendered with jitter has it already. The standard errors
+    of the mean assume one sign for all pixel errors.
     """
     if "auto" in settings:
         name = ("gain", "optical_density")[settings.index("auto")]

@@ -124,13 +124,13 @@ def decide(
     """Find the echoes of records, and decide what the first ones are.
 
     That is for angles below 60 degrees, and bottoms less than 2 m deep: others are those of `find_echoes`.
-    An object above the water is an echo more than 4 standard deviations before the surface's level, and 1.2 echo widths
-    before others. First echoes without others, or with others nearer than 1.8 echo widths, are those of
+    An echo that is more than 4 standard deviations before the surface's level, and 1.2 echo widths before others, is an
+    object above the water. First echoes without others, or with others nearer than 1.8 echo widths, are those of
     `first_echoes.first_echoes`, unless they are at the surface's level and a column follows them. A surface without a
-    column is likelier than land, or has a probability of 90 % where it is a bottom rather than land. Echoes below 8
-    standard errors are the surface's, with the probability of this, unless they are more than 2.5 standard deviations
-    behind its level. In the near infrared, column and bottom are part of the surface's echo. A first echo there is land
-    or the surface, and nothing follows the surface.
+    column is likelier than land, or has a probability of 90 % where it is a bottom rather than land. Echoes
+    below 8 standard errors are the surface's, with the probability of this, unless they are more than 2.5 standard
+    deviations behind its level. In the near infrared, where column and bottom are part of the surface's echo, a first
+    echo is land or the surface, and nothing follows the surface.
 
     150 records of each kind were drawn: VQ-880-G II at nadir and 600 m, a level known to 0.15 m, glints from none to
     five times the bottom's echo, reflectances 0.05 to 0.4. All land from 0.2 to 4 m is land, and 99 % of the bottoms
@@ -305,9 +305,9 @@ def _without_second_return(
 ) -> DetectedEchoes:
     """Return echoes without bottoms that are the light of a target which the surface has reflected, and so met twice.
 
-    Totally reflected light arrives from 2.34 times the depth on, where it is brightest. It is at most 0.8 rho w/d of
-    the bottom's echo per pulse width w and delay d. Without an echo the surface is in the bins `level`; for targets,
-    within `shallow` bins after it.
+    Totally reflected light arrives from 2.34 times the depth on, where it is brightest: at most 0.8 rho w/d of the
+    bottom's echo per pulse width w and delay d. Without an echo the surface is in the bins `level`; for targets, within
+    `shallow` bins after it.
     """
     bins, flags = found.bins.copy(), found.flags.copy()
     surface = np.where(bins[0] >= 0, bins[0], level)

@@ -154,11 +154,11 @@ def extract(
     time of the column's onset, like all beyond 60 degrees from nadir. They have neither amplitude nor width.
 
     Saturated samples do not count for ``gaussian`` and the column: an echo may be anywhere in the clipped time. Light
-    that a bottom returns twice arrives from twice its depth. Where the half depth is clipped, an echo is ``saturated``,
+    that a bottom returns twice arrives from twice its depth: where the half depth is clipped, an echo is ``saturated``,
     too, and has this half as an error. ``depth_m_stderr`` is the error by noise, by saturation, and by the jitter of
-    the record's trigger and clocks. The jitter cancels where the pixel's own surface echo counts. The method errs by
-    more: For ``gaussian``, ``depth_m_method_error`` states the typical error by waves, by scattered light that arrives
-    later, and by the light distribution in the pixel. The surface echo samples this light at few places; see
+    the record's trigger and clocks, which cancels where the pixel's own surface echo counts. The method errs by more:
+    For ``gaussian``, ``depth_m_method_error`` states the typical error by waves, by scattered light that arrives later,
+    and by the light distribution in the pixel, which the surface echo samples at few places; see
     `depth_errors.DepthErrors`. Its constants are from 40 random level seas and 36 shots on waves, the delay by
     scattering from single-scattering theory. In waters IB to 7C at 6 m/s, from 4 m on, the rms error over both errors
     together was 0.8 to 1.1 for ``published_airborne`` and 0.7 to 1.3 for ``teledyne_czmil``. Depths of 2 m have no
@@ -195,8 +195,8 @@ def extract(
     turbid     40 10   -   -0.64   -   -0.36   -   +0.27   -   +0.34 +0.03 +0.12 -1.02 -0.23
     ======= ===== == =========== =========== =========== =========== =========== ===========
 
-    In water that only absorbs, near facets return most light. Up to 20 degrees, all methods but threshold and edge then
-    have surface biases up to 0.06. Bottom biases reach 0.01; edges of wide echoes are early. The water causes the rest.
+    In water that only absorbs, up to 20 degrees, all methods but threshold and edge have surface biases up to 0.06, as
+    near facets return most light. Bottom biases reach 0.01; edges of wide echoes are early. The water causes the rest.
     Light scattered near the surface follows the surface echo and delays its peak and centroid by 0.1 to 1.8 (surface
     penetration). Scattered light reaches the bottom 0.02 to 0.1 later. It arrives no earlier than direct light
     (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo. The attenuation K is that

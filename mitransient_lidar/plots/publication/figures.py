@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.files import together
-from mitransient_lidar.core.options import Option, SeaSeed, checked, positive_option
+from mitransient_lidar.core.options import Option, checked, positive_option
 from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication import waveforms
@@ -76,7 +76,7 @@ def figures(
     *,
     target_error: Annotated[float, Option("Relative standard error of the median bin", 0, 1, above=True)] = 0.01,
     max_time: Annotated[float | None, positive_option("Begin no figure after this many seconds")] = None,
-    seed: SeaSeed = 0,
+    seed: Annotated[int, Option("Random seed", 0, 2**31)] = 0,
     progress: ProgressCallback | None = None,
 ) -> Publication:
     """Make the figures for FOI's multipixel lidar model (Tulldahl 2006), and the table with its statements.
