@@ -1,7 +1,7 @@
 """Simulator of multipixel depth-sounding lidar, built on Mitsuba 3 and Dr.Jit.
 
-Importing the package finds LLVM, chooses a Mitsuba variant when none is set, and registers the plugins, so
-that plain Mitsuba loads and renders lidar scenes::
+Importing the package finds LLVM, chooses a Mitsuba variant when none is set, and registers the plugins. Plain Mitsuba
+then loads and renders lidar scenes::
 
     import mitransient_lidar  # before mitsuba: it finds LLVM for Dr.Jit
     import mitsuba as mi
@@ -9,8 +9,8 @@ that plain Mitsuba loads and renders lidar scenes::
     scene = mi.load_file("scene.xml")
     energy = mi.render(scene)  # received energy in J, (pixel, time)
 
-:func:`render` renders to an accuracy instead and returns waveforms with standard errors as an
-``xarray.Dataset``; :func:`open` reads such a result back from an EXR stack or a NetCDF file.
+:func:`render` renders to an accuracy instead and returns waveforms with standard errors as an ``xarray.Dataset``.
+:func:`open` reads such a result back from an EXR stack or a NetCDF file.
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ def register(kind: str, plugin: Plugin, described: type | None = None) -> Callab
     and the example in XML.
 
     The objects get ``parameters``: the plugin's name as ``type``, each parameter's value that they have read, and
-    nested objects; and a description that lists these.
+    nested objects. They also get a description that lists these.
     """
 
     def registered(make: _Made) -> _Made:

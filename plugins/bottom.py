@@ -210,7 +210,7 @@ class Seabed(mi.Mesh):
     The reflectance is a mesh attribute, ``vertex_reflectance``, which a nested BSDF may use through Mitsuba's
     ``mesh_attribute`` texture.
 
-    Where the bottom rises through the sea it is land, with the same reflectance dry and wet, and the sea ends where it
+    Where the bottom rises through the sea it is land, with the same reflectance dry and wet. The sea ends where it
     meets the bottom. Dry land of another reflectance is a patch, or another shape. Land within ``size`` takes time, as
     light is then also traced in the air; a smaller size leaves it out.
 

@@ -226,7 +226,7 @@ class Retroreflector(SampledBSDF):
     the Gaussian of the sphere (Fisher 1953, doi:10.1098/rspa.1953.0064), normalised over all directions. The BSDF is
     reciprocal, and reflects at most *R*. A narrow lobe with :math:`\sigma = w/2` loses the share :math:`0.4\,\sigma
     \tan\theta_i` at oblique incidence, more where a part falls behind the surface. Straight back it reflects
-    :math:`(1-s) R / (2\pi\sigma^2)` per steradian at any angle; real prisms and beads reflect less beyond about 30
+    :math:`(1-s) R / (2\pi\sigma^2)` per steradian at any angle. Real prisms and beads reflect less beyond about 30
     degrees.
 
     It reflects on the side of its normal only; ``twosided`` makes it reflect on both. A lobe much narrower than the

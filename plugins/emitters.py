@@ -30,10 +30,9 @@ class LidarTransmitter(EmitterWithoutExtent):
 
     .. math:: g(g_x, g_y) = \exp(-(g_x^2 + g_y^2) / 2\sigma^2) / (2 \pi \sigma^2)
 
-    (+angle_x is away from nadir, +angle_y to the left, along +y), with a sigma for each axis when it is elliptic; an
-    image beam is even within each cell. The radiant intensity follows from
-    :math:`d\Omega = (1 + g_x^2 + g_y^2)^{-3/2}\, dg_x\, dg_y`. The pulse's shape is applied to waveforms, not in the
-    transport.
+    (+angle_x is away from nadir, +angle_y to the left, along +y), with a sigma for each axis when it is elliptic. An
+    image beam is even within each cell. The radiant intensity follows from :math:`d\Omega = (1 + g_x^2 +
+    g_y^2)^{-3/2}\, dg_x\, dg_y`. The pulse's shape is applied to waveforms, not in the transport.
 
     Laser and receiver are both above the sea or both under water. Under water, angles are angles in the water: behind a
     flat window, the angles in air divided by the refractive index. Radiance is radiance in the water, and the

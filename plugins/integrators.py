@@ -113,12 +113,12 @@ class LidarPassIntegrator(PassIntegrator):
     ) -> PassRenderer:
         """Return the pass renderer for a scene, by default with one light class and the sensor's own receiver.
 
-        `axis` gives the start or number of time bins that the film leaves to the scene; without it they contain all
+        `axis` gives the start or number of time bins that the film leaves to the scene. Without it they contain all
         light (`find_lidar_scene`).
 
         `layout_of` is another scene's renderer, whose time bins, points and cells are used. Scenes that differ by a
         target, or slightly in a parameter, then make the same paths from the same seeds. Without `connections`, paths
-        that miss the target return the same light with and without it, except for light in full cells; errors with
+        that miss the target return the same light with and without it, except for light in full cells. Errors with
         narrow beams are larger.
 
         Raises UserError when the scene lacks a part or has one that is not supported.
@@ -147,18 +147,18 @@ class LidarMerging(LidarPassIntegrator):
     in arsinh(*r*/*q*). Cells are thus small where the light is concentrated, and grow with the distance from a narrow
     beam. Their thickness is half the point distance, at most 0.3 attenuation lengths. They are thinner near the surface
     where a narrow beam spreads fast, where facets are small, and in turbid water. Patches on solids that look up or
-    down are such sectors, too; on the axis they grow with depth at most twice as much as unscattered light.
+    down are such sectors, too. On the axis they grow with depth at most twice as much as unscattered light.
 
     Within a cell, light is counted where it meets a common plane, at a random depth in each pass. The receiver's paths
     look it up where the light at their points would meet that plane. This is along the beam as the facet above refracts
     it, at an offset that grows as ripples spread the beam. Narrow beams thus stay sharp, however waves refract them.
 
-    In images with 4096 pixels or more, every second receiver path is merged in the water, with double weight; all are
+    In images with 4096 pixels or more, every second receiver path is merged in the water, with double weight. All are
     merged on solids, whose pixels need more paths.
 
-    Some receiver points are connected, over any distance, with a random light point or with light on a solid, by a
-    segment in the water. Light that is scattered into or out of a narrow beam far from the axis rarely meets a small
-    cell; connections find it (Georgiev et al. 2012, doi:10.1145/2366145.2366211).
+    Some receiver points are connected with a random light point or with light on a solid. A segment in the water joins
+    them over any distance. Light that is scattered into or out of a narrow beam far from the axis rarely meets a small
+    cell. Connections find it (Georgiev et al. 2012, doi:10.1145/2366145.2366211).
 
     A path with several scattering events can arise from a merge at each of them, and from a connection between any two
     that follow each other. The balance heuristic (Veach and Guibas 1995, doi:10.1145/218380.218498) weights all. With
@@ -276,7 +276,7 @@ class PassiveVolpath(PassIntegrator):
     in ``lidar_volpath``. The sun replaces the laser: each path is connected to one point on the sun's disc. Paths that
     leave the scene meet the sky. A separate ray samples the sky that the sea reflects, as few paths are reflected.
 
-    The sea must be rough, as every ``ocean_surface`` is: through a smooth ``dielectric`` paths meet the sun's disc only
+    The sea must be rough, as every ``ocean_surface`` is. Through a smooth ``dielectric`` paths meet the sun's disc only
     by chance, and the image is noisy. Distances to scattering events are drawn from the scattering coefficient, and
     absorption is a weight.
 

@@ -48,10 +48,9 @@ class LayeredWater(mi.Medium):
     description holds for all layers, or is a list with one value per layer: ``1C, 5C``. `physics.water.water_types`
     states sources and uncertainties, and ``mitransient-lidar scenes water`` prints the coefficients.
 
-    At a ``wavelength_nm`` above 700, a named or default water absorbs like pure water (14.4 1/m at 1064 nm), and its
+    At a ``wavelength_nm`` above 700, a named or default water absorbs like pure water (14.4 1/m at 1064 nm). Its
     particles scatter in proportion to 1/wavelength. Coefficients given as numbers stay unchanged, with a warning where
-    they absorb less than pure water; with
-    ``coefficients_nm`` = 532 they are taken there likewise.
+    they absorb less than pure water. With ``coefficients_nm`` = 532 they are taken there likewise.
 
     The first layer includes the wave crests above z = 0, the last one is infinitely deep. With ``petzold``, ``hg`` or a
     nested phase function, bb follows from that function and ``backscattering`` is only checked.
@@ -65,13 +64,13 @@ class LayeredWater(mi.Medium):
     :math:`10^{-4.5}`, and were much the same in all winds below 16 m/s (Czerski et al. 2022,
     doi:10.5194/os-18-565-2022).
 
-    Layers with different refractive indices refract light, or reflect it totally; the partial reflection (5e-6 between
-    fresh and sea water at vertical incidence) is left out. At most 16 such layers are allowed, and they must begin
-    below the wave troughs.
+    Layers with different refractive indices refract light, or reflect it totally. Their partial reflection (5e-6
+    between fresh and sea water at vertical incidence) is left out. At most 16 such layers are allowed, and they must
+    begin below the wave troughs.
 
     The lidar integrators sample free flights and transmittances through all layers in closed form. Mitsuba's own
-    volumetric integrators work as well, with null collisions against the largest attenuation and the first layer's
-    phase function and index in all layers.
+    volumetric integrators work as well, with null collisions against the largest attenuation. They use the first
+    layer's phase function and index in all layers.
 
     .. example::
 
@@ -164,7 +163,7 @@ def _read_water(
 def _column(props: DeclaredProperties, is_of_phase: bool) -> tuple[WaterColumn, np.ndarray, float | None]:
     """Return the layers by coefficients, named water or profile, their scattering by molecules and the wavelength.
 
-    The scattering by molecules [1/m] has one value per layer or one for all, 0 where unknown; the wavelength [nm] is
+    The scattering by molecules [1/m] has one value per layer or one for all, 0 where unknown. The wavelength [nm] is
     None where none is given. With `is_of_phase`, backscattering follows from a phase function: the parameter then may
     reach the scattering.
     """

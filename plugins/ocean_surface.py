@@ -37,7 +37,7 @@ class OceanSurface(mi.Mesh):
 
     .. parameters::
 
-    The automatic shortest wave is the beam's standard deviation on the sea or, if shorter, four pixels, 0.08 to 2 m; it
+    The automatic shortest wave is the beam's standard deviation on the sea or, if shorter, four pixels, 0.08 to 2 m. It
     does not depend on the cells. Automatic cells are a twelfth of that standard deviation and at most half a pixel's
     side, 0.02 to 0.25 m. The patch contains beam and field of view with a margin of 8 m. Where it would have more than
     512 cells per side, the beam's cells grow up to a quarter of its standard deviation. With more than 1024 the patch
@@ -49,18 +49,18 @@ class OceanSurface(mi.Mesh):
     an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, the model for Gaussian slopes.
     Its index is the water's ``refractive_index``. Texture coordinates run along and across the wind. With ``cox_munk``
     and ``spectrum`` the total depends neither on the cells nor on the shortest wave. The ripple variance is at least
-    1e-5, so that a point laser can be connected; the loaded object's `slope_variance` is the total. A mesh needs waves
+    1e-5, so that a point laser can be connected. The loaded object's `slope_variance` is the total. A mesh needs waves
     shorter than a sixteenth of the period: where automatic cells are longer, all slopes are ripples.
 
     Real slopes are skewed and peaked. With ``slope_distribution`` ``gram_charlier`` the ripples are a
     ``gram_charlier_dielectric``. Their third and fourth moments let waves and ripples together reach Cox and Munk's
-    slope density. At 20 degrees off nadir it is 1.19 times the Gaussian density looking upwind and 0.74 downwind at 6
-    m/s, 0.95 and 0.87 at 10 m/s, and 1.11 at nadir. It was measured up to 2.5 standard deviations, with standard errors
-    of 0.03 (c21), 0.12 (c03), 0.23 (c40), 0.06 (c22) and 0.41 (c04). Ripples with a small share of the slope variance
-    (below 0.3 to 0.4, at 14 m/s 0.6) would need negative densities, and are refused. Narrow beams, which resolve short
-    waves, then need a longer ``shortest_wave``.
+    slope density. At 20 degrees off nadir and 6 m/s it is 1.19 times the Gaussian density looking upwind and 0.74
+    downwind. At 10 m/s it is 0.95 and 0.87 times, and 1.11 at nadir. It was measured up to 2.5 standard deviations,
+    with standard errors of 0.03 (c21), 0.12 (c03), 0.23 (c40), 0.06 (c22) and 0.41 (c04). Ripples with a small share of
+    the slope variance (below 0.3 to 0.4, at 14 m/s 0.6) would need negative densities, and are refused. Narrow beams,
+    which resolve short waves, then need a longer ``shortest_wave``.
 
-    Finer cells show the same waves with smoother facets: halving automatic cells changes the surface echo by less than
+    Finer cells show the same waves with smoother facets. Halving automatic cells changes the surface echo by less than
     a render's default error, 3 %. The shortest wave divides the sea into waves, drawn by the seed, and ripples, the
     mean over all shorter waves. The mean echo over many seas does not depend on it; the echo at one location does.
     Changes in the echo of a 10 mrad beam from 200 m, rms over 64 locations:
@@ -86,21 +86,21 @@ class OceanSurface(mi.Mesh):
     under water have none. Give ``shortest_wave`` to compare images with few-pixel receivers on exactly the same sea.
 
     With more than 1024 of the shortest waves (or pairs of cells) per period, the waves are a sum of bands. The longest
-    waves equal the waves in coarse cells; each band of shorter ones repeats after an odd fraction (1/3 to 1/31) of the
+    waves equal the waves in coarse cells. Each band of shorter ones repeats after an odd fraction (1/3 to 1/31) of the
     previous period.
 
     Over a shallow bottom (``shoaling``) waves are divided into bands of half an octave, each with the TMA spectrum's
     amplitude at the local depth. The significant height is at most half the depth, as the longest waves are lost, and
-    all waves end at the water line; ripples stay. The depth is the depth of the largest solids under each vertex: their
+    all waves end at the water line. Ripples stay. The depth is the depth of the largest solids under each vertex: their
     rendered faces, without instances, targets and piers, continued beyond their edges. At 10 m/s over 0.3 m the waves
     have a significant height of 0.15 m instead of 2.6 m. Crests neither turn nor come closer together, and do not run
     up the shore. Wake heights stay within a quarter of the depth; a mean slope stays as given.
 
-    Foam (``foam``) covers whole faces. It is a thin layer that reflects ``foam_reflectance``, from above and from
-    below, and transmits ``foam_transmittance`` as a ``leaf`` does, both evenly over all directions. It absorbs the
-    rest. It lies where the waves rise most above their surroundings within 2 m, and thus follows the crests of short
-    waves, as many as give the cover. On a sea without waves each face has the cover as a share. Foam approaches
-    ``surf_foam`` where the depth limits the waves. A ``foam_map`` states where foam lies besides.
+    Foam (``foam``) covers whole faces. It is a thin layer that reflects ``foam_reflectance`` from above and from below.
+    It transmits ``foam_transmittance`` as a ``leaf`` does. Both are even over all directions. It absorbs the rest. It
+    lies where the waves rise most above their surroundings within 2 m, and thus follows the crests of short waves, as
+    many as give the cover. On a sea without waves each face has the cover as a share. Foam approaches ``surf_foam``
+    where the depth limits the waves. A ``foam_map`` states where foam lies besides.
 
     A mean slope turns the sea about the patch centre, or about each shot's location in a series. It is as wide as the
     patch; beyond it the sea is level. It adds to the wave slopes, and not to ``slope_variance``.

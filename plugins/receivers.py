@@ -132,8 +132,8 @@ class MultipixelReceiver(ReceiverSensor):
     With a fill factor, each ``RxC`` cell shrinks about its centre: its sides by the square root of the factor. A
     circular field of view cuts the shrunk cells as a field stop does.
 
-    Blur distributes light from the direction (angle_x, angle_y) around that point on the detector by the point-spread
-    function, which is the same all over the field of view. Light between pixels is lost.
+    Blur distributes light from the direction (angle_x, angle_y) around that point on the detector. The point-spread
+    function is the same all over the field of view. Light between pixels is lost.
 
     .. example::
 

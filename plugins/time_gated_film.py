@@ -24,7 +24,7 @@ class TimeGatedFilm(mi.Film):
 
     .. parameters::
 
-    With ``auto`` the record is chosen when a scene is rendered, anew after each edit; a result lists it as ``used`` in
+    With ``auto`` the record is chosen when a scene is rendered, anew after each edit. A result lists it as ``used`` in
     ``plugin_parameters``. It starts before the first light in any pixel, from the highest crest or a target above it.
     The lead is three pulse widths or a measured pulse's length, at least 12 ns. It also starts ten bins before the end
     of the interval in which ``echoes`` measures the noise, by up to 100 ns more. It ends as much, plus 12 times the

@@ -58,7 +58,7 @@ SURVEY_ORDERS = (
 def order_met(depth: npt.ArrayLike, tvu: npt.ArrayLike, thu: npt.ArrayLike) -> IntArray:
     """Return the strictest order that total vertical and horizontal uncertainties at 95 % [m] meet at depths [m].
 
-    It is the place in `SURVEY_ORDERS`, their number where no order is met, and -1 where an uncertainty is NaN; shapes
+    It is the place in `SURVEY_ORDERS`, their number where no order is met, and -1 where an uncertainty is NaN. Shapes
     broadcast.
     """
     d, vertical, horizontal = np.broadcast_arrays(*(np.asarray(one, dtype=np.float64) for one in (depth, tvu, thu)))
@@ -78,8 +78,8 @@ class TrajectoryErrors(NamedTuple):
 def shift_by_slope(off_nadir: float, n: float) -> tuple[float, float]:
     """Return the horizontal shifts of a bottom point by a sea slope that is assumed to be level.
 
-    They are per depth and slope [1], in the line of sight and across it, to first order, for a beam angle from the
-    vertical [rad] and a refractive index of the water.
+    They are per depth and slope [1], in the line of sight and across it, to first order. Arguments are the beam angle
+    from the vertical [rad] and the water's refractive index.
     """
     turn, cos_water = float(turn_by_slope(off_nadir, n)), float(np.cos(snell(off_nadir, n)))
     return turn / cos_water**2, turn
@@ -119,11 +119,12 @@ def sounding_uncertainty(table: xr.Dataset, trajectory: TrajectoryErrors | None 
 
     Notes
     -----
-    ``subaqueous_vertical`` is the root mean square error of depths below the sea in the beam, over shots on all waves
-    at a wind: sqrt(bias^2 + spread^2), for the channel with the smallest. ``subaqueous_horizontal`` combines two parts:
-    the refraction by the mean slopes in the beam, which a survey assumes to be level (pooled over waters and depths at
-    a wind), and the beam's standard deviation on the sea. ``tvu`` is 1.96 times, ``thu`` 2.45 times the root of the
-    summed squares of these and of the trajectory errors; horizontal errors are means over both axes.
+    ``subaqueous_vertical`` is the root mean square error of depths below the sea in the beam, sqrt(bias^2 + spread^2).
+    It is taken over shots on all waves at a wind, for the channel with the smallest. ``subaqueous_horizontal`` combines
+    two parts. One is the refraction by the mean slopes in the beam, which a survey assumes to be level (pooled over
+    waters and depths at a wind). The other is the beam's standard deviation on the sea. ``tvu`` is 1.96 times, ``thu``
+    2.45 times the root of the summed squares of these and of the trajectory errors. Horizontal errors are means over
+    both axes.
     """
     trajectory = trajectory or TrajectoryErrors()
     one = table.isel(estimator=0, drop=True).transpose(*AXES, "pixel", ...)
@@ -163,8 +164,8 @@ def sounding_uncertainty(table: xr.Dataset, trajectory: TrajectoryErrors | None 
 def non_negative_line(x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[float, float]:
     """Return the least-squares line's intercept and slope, both at least 0.
 
-    NaN among `y` are left out; without any other both are NaN, and of values at a single x the line is constant. With
-    two unknowns the solution is the unconstrained one, the proportional one, or the constant one.
+    NaN among `y` are left out. Without any other both are NaN, and for a single x the line is constant. With two
+    unknowns the solution is the unconstrained one, the proportional one, or the constant one.
     """
     values: FloatArray = np.asarray(y, dtype=np.float64)
     known = np.isfinite(values)

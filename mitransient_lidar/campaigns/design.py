@@ -20,7 +20,7 @@ import numpy.typing as npt
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import is_there, read_text
 from mitransient_lidar.core.formats.documents import parse_toml, table
-from mitransient_lidar.core.options import BackgroundPower, Option, Plan, positive_option
+from mitransient_lidar.core.options import BackgroundPower, Option, Plan, Seed, positive_option
 from mitransient_lidar.core.validation import FloatArray, finite, is_number, shown
 from mitransient_lidar.physics.receiver.receiver_files import Setting
 from mitransient_lidar.rendering.passes import LightOption
@@ -172,7 +172,7 @@ class Design(Plan):
     kind: Annotated[DesignKind, Option("Kind, by default table with a file")] = "sobol"
     count: Annotated[int | None, Option("Number of runs", 1, MOST_RUNS)] = None
     shots: Annotated[int, Option("Places on each sea", 1, MOST_SHOTS)] = 1
-    seed: Annotated[int, Option("Random seed", 0, 2**32 - 1)] = 0
+    seed: Seed = 0
     file: Annotated[str | None, Option("CSV file with a row for each run", form="the name of a CSV file")] = None
 
     def __post_init__(self) -> None:

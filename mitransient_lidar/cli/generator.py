@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import inspect
+import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +23,8 @@ from mitransient_lidar.core.options import Option, declared
 from mitransient_lidar.core.validation import finite, number_list
 
 Define = Annotated[
-    list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter. Repeatable.")
+    list[str] | None,
+    typer.Option("-D", "--define", metavar="NAME=VALUE", help="Set a scene parameter. Repeatable."),
 ]
 DrawingOnly = Annotated[Path | None, Option("PNG, PDF or SVG file to write")]
 OUTPUT = Path("output")  #: Default folder for rendered files.
@@ -47,6 +49,13 @@ Lidar = Annotated[
     ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and errors.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
+
+
+def print_json(values: Any) -> None:
+    """Print values as JSON, and numbers that are not finite as null."""
+    text = json.dumps(values, default=lambda array: array.tolist())
+    typer.echo(json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2, ensure_ascii=False))
 
 
 def waveform_selection(
@@ -56,13 +65,13 @@ def waveform_selection(
     given = {"--waveforms": waveforms, "--channel": channel, "--lidar": lidar}
     if file.suffix.lower() not in (".las", ".laz", ".pls", ".wvs"):
         if named := [name for name, value in given.items() if value]:
-            raise UserError(f"{named[0]} is for LAS, LAZ and PulseWaves files, and {file} is none.")
+            raise UserError(f"{named[0]} is for LAS, LAZ and PulseWaves files, and {file} is none")
         return {}
     limits = None
     if waveforms is not None:
         ends = [end.strip() for end in waveforms.split(":")]
         if len(ends) != 2 or not all(end.isdecimal() or not end for end in ends):
-            raise UserError(f"--waveforms {waveforms} is not of the form FIRST:END.")
+            raise UserError(f"--waveforms {waveforms} is not of the form FIRST:END")
         limits = int(ends[0] or 0), int(ends[1]) if ends[1] else None
     known = dict(name_and_value("--lidar", text) for text in lidar or [])
     return {"waveforms": limits, "channel": channel, "lidar": known}
@@ -311,7 +320,7 @@ def _typer(name: str, option: Option, default: Any) -> Any:
     return typer.Option(
         *(["-o"] if given == "--output" else []),
         given if default is not True else f"{given}/--no-{given.removeprefix('--')}",
-        metavar=option.form or None,
+        metavar=option.form or ("DIR" if option.meaning.startswith("Folder") else None),
         help=option.help(),
     )
 

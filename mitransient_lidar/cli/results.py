@@ -68,9 +68,9 @@ def _view(
         selection = {}
     if is_scene := names_scene(file) or is_points:
         for option in [name for name, given in {**others, "--shot": shot is not None}.items() if given]:
-            raise UserError(f"{option} needs a result: {file} is a scene or points.")
+            raise UserError(f"{option} needs a result: {file} is a scene or points")
     if define and not names_scene(file):
-        raise UserError(f"-D needs a scene: {file} is none.")
+        raise UserError(f"-D needs a scene: {file} is none")
     if is_scene or (not any(others.values()) and is_page):
         _show(file, output, shot, browser, define, quiet, selection)
         return
@@ -164,21 +164,25 @@ def _compare(
     ],
     second: Annotated[Path, Option("A result with the same pixels and bins or gates", form="OTHER", is_argument=True)],
     output: generator.DrawingOnly = None,
+    as_json: generator.Json = False,
     waveforms: generator.Waveforms = None,
     channel: generator.Channel = None,
     lidar: generator.Lidar = None,
 ) -> None:
     """Test whether two results agree within their errors.
 
-    Draws both and prints the path; exit code 1 if they differ.
+    Draws both and prints the path, without --json; exit code 1 if they differ.
     """
     from mitransient_lidar import results
     from mitransient_lidar.analysis import comparison
     from mitransient_lidar.plots.waveforms import plot_comparison
     from mitransient_lidar.results.waveform_files import is_waveform_file
 
+    if as_json and output is not None:
+        raise UserError("--json draws nothing: leave out --output")
     target = output or second.with_name(f"{first.stem}_{second.stem}.png")
-    check_figure(target)
+    if not as_json:
+        check_figure(target)
     recorded = [one for one in (first, second) if is_waveform_file(one)]
     selection = generator.waveform_selection(recorded[0] if recorded else first, waveforms, channel, lidar)
     given = (
@@ -187,12 +191,16 @@ def _compare(
     )
     datasets = comparison.as_bins(*given)
     outcome = comparison.compare(*datasets)
-    with announced():
-        plot_comparison(*datasets, outcome, target)
-    typer.echo(
-        f"{'agree' if outcome.agrees else 'differ'}: {outcome.bin_count} bins, rms {outcome.rms:.2f} and largest "
-        f"{outcome.largest:.1f} standard errors (chance explains {outcome.limit:.1f}); energy x "
-        f"{outcome.energy_ratio:.4f} +- {outcome.energy_ratio_stderr:.4f}"
-    )
+    if as_json:
+        names = ("agrees", "bin_count", "rms", "largest", "limit", "energy_ratio", "energy_ratio_stderr")
+        generator.print_json({name: getattr(outcome, name) for name in names})
+    else:
+        with announced():
+            plot_comparison(*datasets, outcome, target)
+        typer.echo(
+            f"{'agree' if outcome.agrees else 'differ'}: {outcome.bin_count} bins, rms {outcome.rms:.2f} and largest "
+            f"{outcome.largest:.1f} standard errors (chance explains {outcome.limit:.1f}); energy x "
+            f"{outcome.energy_ratio:.4f} +- {outcome.energy_ratio_stderr:.4f}"
+        )
     if not outcome.agrees:
         raise typer.Exit(_DIFFERENT)

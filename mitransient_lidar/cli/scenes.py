@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_targets, write_page
-from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, DrawingOnly, Quiet, function_at
+from mitransient_lidar.cli.generator import OUTPUT, Call, Commands, DrawingOnly, Json, Quiet, function_at, print_json
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.options import Option
@@ -70,6 +70,7 @@ def _copy(
 def _instruments(
     name: Annotated[str | None, Option("Name of an instrument", form="NAME", is_argument=True)] = None,
     xml: Annotated[bool, Option("Print the XML of laser and receiver, to include in a scene")] = False,
+    as_json: Json = False,
 ) -> None:
     """List the instruments, or print the parameters of one with their sources.
 
@@ -78,16 +79,25 @@ def _instruments(
     """
     from mitransient_lidar.loading import catalogue as shipped
 
+    if xml and as_json:
+        raise UserError("--xml and --json are alternatives: give one of them")
     if name is None:
         if xml:
             raise UserError("--xml needs the name of an instrument")
         known = [(one := shipped.read_instrument(each), len(one.channels)) for each in shipped.instrument_names()]
+        if as_json:
+            print_json({one.name: one.title for one, _ in known})
+            return
         _print((one.name, f"{one.title}; {count} channel{'s' * (count > 1)}") for one, count in known)
         return
     if xml:
         typer.echo(shipped.instrument_text(name), nl=False)
         return
     one = shipped.read_instrument(name)
+    if as_json:
+        listed = {each.name: {"value": each.value, "source": each.source} for each in one.parameters if each.value}
+        print_json({"title": one.title, "channels": one.channels, "parameters": listed})
+        return
     typer.echo(f"{one.title}\n\n{one.description}\n\nchannels: {', '.join(one.channels)}\n")
     _print(((each.name, each.value, each.source) for each in one.parameters if each.value), right=(1,))
     typer.echo(f"\n{shipped.receiver_text(name)}", nl=False)
@@ -133,6 +143,7 @@ def _figures(
 @COMMANDS.add(_HEADING, "", "output/table1.nc")
 def _info(
     file: Annotated[Path | None, Option("An EXR or NetCDF result", form="FILE", is_argument=True)] = None,
+    as_json: Json = False,
 ) -> None:
     """Print versions, the Mitsuba variant and LLVM's path, or a result's parameters.
 
@@ -142,12 +153,24 @@ def _info(
     if file is None:
         from mitransient_lidar.loading import variants
 
-        facts = variants.describe()
+        facts: dict[str, Any] = {**variants.describe()}
     else:
         from mitransient_lidar.rendering.again import describe_result
 
         facts = describe_result(file)
-    _print((name, str(value)) for name, value in facts.items())
+    if as_json:
+        print_json(facts)
+    else:
+        _print((name, _text(value)) for name, value in facts.items())
+
+
+def _text(value: Any) -> str:
+    """Return a value in one line."""
+    if value is None:
+        return "-"
+    if isinstance(value, list):
+        return ", ".join(map(_text, value))
+    return f"{value:.9g}" if isinstance(value, float) else " ".join(str(value).split())
 
 
 @COMMANDS.add(_HEADING, "studies.bench:run", "--quick")

@@ -20,7 +20,7 @@ def printable(text: str, kept: str = "") -> str:
 class UserError(ValueError):
     """Invalid user input: a wrong name, value or file.
 
-    Its message is one sentence that names the parameter or path, its value, and the allowed values; it is `printable`,
+    Its message is one sentence that names the parameter or path, its value, and the allowed values. It is `printable`,
     and beyond 2000 characters its middle is left out. The command line prints it without a traceback and exits with
     code 2.
     """

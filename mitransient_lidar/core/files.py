@@ -69,9 +69,9 @@ def is_file_name(name: object) -> bool:
 def open_file(path: str | os.PathLike[str]) -> BufferedReader:
     """Open a regular file for reading; a link to one, too.
 
-    Every reader of a file that a user or another file names opens it here, or gives a library that takes a path a
-    `check_regular` path: a named pipe or a device would wait for ever, or never end. Raises `UserError` if there is no
-    such file, or it cannot be opened, or is a folder, a named pipe, a device or a socket.
+    Every reader of a file that a user or another file names opens it here. Libraries that take a path get a path that
+    `check_regular` has checked. A named pipe or a device would wait for ever, or never end. Raises `UserError` if there
+    is no such file, or it cannot be opened, or is a folder, a named pipe, a device or a socket.
     """
     # Before it is opened, which may act on a device; and again, since another file may have come in its place.
     check_regular(path)
@@ -206,8 +206,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 def together() -> Iterator[list[Path]]:
     """Move all files that `replacing` writes in this context to their places at its end; on a failure, none of them.
 
-    Yields a list that holds their paths, in order, after the context; a context within another one joins it, and its
-    list stays empty. On any failure the former files stay; only a process that is killed during the moves, which take
+    Yields a list that contains their paths, in order, after the context. A context within another one joins it, and its
+    list stays empty. On any failure the former files stay. Only a process that is killed during the moves, which take
     less than a millisecond, leaves some of them. An interruption waits until all files are in their places. Raises
     `WriteError` if the operating system reports an error.
     """

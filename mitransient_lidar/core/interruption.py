@@ -54,8 +54,8 @@ class TerminationAsInterrupt:
 class DeferredInterrupt:
     """Context in which an interruption waits for `check` or the context's end; a second one takes effect at once.
 
-    An interruption during a pass would become a ``RuntimeError`` in the loop that Dr.Jit is recording, and one while
-    files are written would lose a render. The context applies to Ctrl-C, and to the signals of
+    An interruption during a pass would become a ``RuntimeError`` in the loop that Dr.Jit is recording. An interruption
+    while files are written would lose a render. The context applies to Ctrl-C, and to the signals of
     `TerminationAsInterrupt`. The outermost of nested contexts defers. Outside the main thread, and with other handlers
     for the signals, nothing changes. Without `at_once` it defers from the first context inside this one on.
     """

@@ -1,8 +1,8 @@
 """Marks that identify a file's origin, where readers of its format skip them.
 
-A mark is JSON text near the end of a file: in a comment in PNG, GIF, PDF, SVG and HTML files, in a free box in MP4
-files, and after the data in NetCDF and EXR files, whose readers find the end of the data. It contains its own position:
-it ceases to count once another program has changed the file's length.
+A mark is JSON text near the end of a file. PNG, GIF, PDF, SVG and HTML files have it in a comment, and MP4 files in a
+free box. NetCDF and EXR files have it after the data, as their readers find the end of the data. It contains its own
+position: it ceases to count once another program has changed the file's length.
 """
 
 from __future__ import annotations

@@ -157,7 +157,7 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     ``class_probability``; and the truth: ``true_z`` [m], the mean surface height in the beam or, for points below it,
     the highest solid at x and y; ``true_target``, whether that solid is a target; and of the pulse
     ``true_surface_height``, ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m]. Points from an infrared
-    channel with its own lines follow, with ``transmitter`` 1 and their own numbers as ``shot``; both channels then give
+    channel with its own lines follow, with ``transmitter`` 1 and their own numbers as ``shot``. Both channels then give
     the surface.
     """
     infrared = None

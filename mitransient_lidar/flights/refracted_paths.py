@@ -72,7 +72,7 @@ class Timing(NamedTuple):
 class RefractedPaths:
     """Paths o + R d + s w of n points: a leg in air and, behind the surface, one in the water.
 
-    With the normal m of the surface, Snell's law is w = d/n + (c/n - c_w) m, where c = -d . m and c_w^2 = 1 - (1 -
+    With the normal m of the surface, Snell's law is w = d/n + (c/n - c_w) m. Here c = -d . m and c_w^2 = 1 - (1 -
     c^2)/n^2. The length in the water is s = (T - R)/n_g with T = R_s + n_g D/cos(theta_w): R_s and D are surface range
     and depth by the echoes, theta_w is a level sea's refracted angle.
     """

@@ -83,15 +83,16 @@ class SurfaceModel:
         -----
         The level is the mean with weights 1/(error^2 + v), with the wave height variance v. This is the points'
         variance, increased by one standard deviation of its error, minus their errors' variance. A plane h + s . (r_i -
-        r) is fitted at a place r to the at most 24 nearest points within the radius. Weights are 1/(error_i^2 +
+        r) is fitted at a place r. It takes the nearest points within the radius, at most 24. Weights are 1/(error_i^2 +
         residual^2), priors h ~ N(level, v) and s ~ N(0, slope_deviation^2). Where points are few, or their errors
         large, it stays level. Times count as distances of 5 m/s. The residual is the most likely one for heights
         predicted from their neighbours. The sea deviates from a plane by it; its slopes by 1.5 residuals over the plane
         points' rms distance.
 
-        Measured in 72 cases: linear waves at winds of 3, 6 and 9 m/s, averaged over beams of 0.6 and 2 m, with 0.5 to
-        10 points a square metre and errors of 2 to 15 cm. The remaining slopes have 0.24 to 1.02 times all slopes'
-        standard deviation (median 0.7). Slope and height errors are 0.4 to 1.7 (median 1.0) times the stated ones.
+        Measured in 72 cases: linear waves at winds of 3, 6 and 9 m/s, averaged over beams of 0.6 and 2 m. The cases
+        have 0.5 to 10 points a square metre and errors of 2 to 15 cm. The remaining slopes have 0.24 to 1.02 times all
+        slopes' standard deviation (median 0.7). Slope and height errors are 0.4 to 1.7 (median 1.0) times the stated
+        ones.
         """
         table = finite_array("points", points)
         sigma, time = finite_array("error", error), finite_array("time_s", time_s)

@@ -2,7 +2,7 @@
 
 A scene is a Mitsuba XML file in ``mitransient_lidar.scenes``; its name is the file name without the suffix. Files
 whose names begin with an underscore are parts that scenes include. An instrument is such a part in the folder
-``instruments``: parameters (``<default>``), emitter and sensor. The first line of its first comment is the title; the
+``instruments``: parameters (``<default>``), emitter and sensor. The first line of its first comment is the title. The
 rest describes the instrument and numbers its sources as [1], [2], ... A parameter's comment on its own line refers to a
 source, or reads "assumed" if there is none.
 """

@@ -2,7 +2,7 @@
 
 Mitsuba stores a parsed scene in double precision. Its objects, which compute in single precision, are then made in a
 frame whose origin is near the aim. This package's plugins with locations take the frame's origin, and keep their
-parameters as scene coordinates; other objects are displaced by their ``to_world``.
+parameters as scene coordinates. Other objects are displaced by their ``to_world``.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ _WITHOUT_PLACE = (
 def move_to_aim(parsed: Any) -> None:
     """Place a parsed scene's objects in a frame about its lidar's aim, if that is far from the scene's origin.
 
-    A scene with loaded objects, with plugins whose locations are unknown, or with a texture on an ``ocean_surface``, or
-    on a seabed and another shape, stays unmoved.
+    A scene stays unmoved if it has loaded objects, plugins whose locations are unknown, or a texture on an
+    ``ocean_surface``, or on a seabed and another shape.
     """
     from mitransient_lidar.plugins.bases import FRAME_ORIGIN
 

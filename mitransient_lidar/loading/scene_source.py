@@ -3,7 +3,7 @@
 A result has these attributes:
 
 ``scene_xml``
-    Text of an XML scene with included files in place; the attributes ``scene.NAME`` are the values of its parameters,
+    Text of an XML scene with included files in place. The attributes ``scene.NAME`` are the values of its parameters,
     including the parameters that its plugins declare.
 ``scene_dict``
     Instead, a scene given as a dict, as JSON (`to_json`).

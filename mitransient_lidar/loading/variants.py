@@ -1,7 +1,7 @@
 """Mitsuba variants: search for LLVM, variant choice, plugin registration; and the turn of threads to use Mitsuba.
 
 Where a kernel adds to an array, each thread in Dr.Jit's pool has its own copy. All other threads in the process share
-one copy, and they help with kernels while they wait: two that wait at once overwrite each other's sums and lose light.
+one copy, and they help with kernels while they wait. Two that wait at once overwrite each other's sums and lose light.
 The virtual function calls that one thread records also see the objects in a scene that another thread is still loading.
 """
 

@@ -127,7 +127,7 @@ def received_power(scene: LidarScene) -> Callable[[FloatArray], FloatArray]:
 class RatioStatistics:
     """Ratio of two sums over passes, and its standard error.
 
-    Each pass adds, for each pixel, radiance times solid angle and its samples' solid angle; the ratio of the sums is
+    Each pass adds, for each pixel, radiance times solid angle and its samples' solid angle. The ratio of the sums is
     the mean radiance. The standard error is first order for a ratio of means (Cochran 1977, Sampling Techniques,
     section 2.11).
     """

@@ -146,8 +146,8 @@ def _series_options(result: Any, attributes: Mapping[str, Any], given: Mapping[s
     }
 
 
-def describe_result(path: str | os.PathLike[str]) -> dict[str, str]:
-    """Return a result's attributes, without JSON or XML texts, and all its plugin parameters, as texts.
+def describe_result(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return a result's attributes, without JSON or XML texts, and all its plugin parameters.
 
     A parameter is named by its object and itself, as ``surface.interior.attenuation``. Raises UserError if the file
     cannot be read.
@@ -157,7 +157,7 @@ def describe_result(path: str | os.PathLike[str]) -> dict[str, str]:
     attributes.pop("plugin_parameters", None)
     long = [name for name, value in attributes.items() if isinstance(value, str) and re.match(r"\s*[\[{<]", value)]
     plain = {name: value for name, value in attributes.items() if name not in long}
-    return {name: _text(value) for name, value in {**plain, **_flat(plugins)}.items()}
+    return {**plain, **_flat(plugins)}
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -166,15 +166,6 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for name, value in values.items():
         flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return flat
-
-
-def _text(value: Any) -> str:
-    """Return a value in one line."""
-    if value is None:
-        return "-"
-    if isinstance(value, list):
-        return ", ".join(map(_text, value))
-    return f"{value:.9g}" if isinstance(value, float) else " ".join(str(value).split())
 
 
 def _integrator(attributes: Mapping[str, Any]) -> dict[str, Any]:

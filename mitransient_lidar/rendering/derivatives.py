@@ -58,8 +58,8 @@ def path_parameters(
 ) -> list[Parameter]:
     """Return the parameters with some names: a coefficient of layered water gives one parameter per layer.
 
-    `others` are the scene parameters, with their values as text; those without path sums are left to central
-    differences; none by default.
+    `others` are the scene parameters, with their values as text, none by default. Those without path sums are left to
+    central differences.
 
     Raises UserError if a name is unknown or given twice, or the light does not depend on the parameter.
     """

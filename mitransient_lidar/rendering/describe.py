@@ -221,8 +221,8 @@ def lines_of_sight(scene: LidarScene, turn_deg: float = 0.0) -> LinesOfSight:
 
     The lidar may be turned about the receiver's axis, from far to left [deg]; angles refer to the unturned lidar.
 
-    Under water they are straight, and ``surface_time`` is where depths on their scale are 0, before the pulse is
-    emitted if the lidar looks down.
+    Under water they are straight, and ``surface_time`` is where depths on their scale are 0. This is before the pulse
+    is emitted if the lidar looks down.
 
     Each pixel uses the better sampled of two point sets: beam points in the pixel, and points in the pixel with the
     beam's density. A pixel without either has the line of sight at its centre and no share.

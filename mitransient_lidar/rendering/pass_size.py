@@ -40,8 +40,8 @@ def fit_to_time(
     """Return a renderer whose passes fit into a time limit, with fewer paths where full passes do not.
 
     Kernels cannot be interrupted. Where many rays are expected for the time, a trial with 1/512 of the paths measures
-    the kernel time. If two full passes would exceed the limit, the path number is halved until four passes fit, or the
-    work besides the kernels takes longer.
+    the kernel time. If two full passes would exceed the limit, the path number is halved. It is halved until four
+    passes fit, or the work besides the kernels takes longer.
 
     `renderer`: renderer for full passes. `max_time`: time limit for the render [s]. `start_ns`: time at which light
     enters the water [ns]. `seed`, `gates`: arguments of `PassRenderer.render_pass` for the first pass. `tiles`: tiles

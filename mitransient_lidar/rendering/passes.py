@@ -39,7 +39,7 @@ MaxTime = Annotated[
 Passes = Annotated[
     int | None, Option("Stop after this many independent passes, by default at the target error", 2, MOST_PASSES)
 ]
-SignedSeed = Annotated[int | None, Option("Random seed, by default 0", -(2**63), 2**63 - 1)]
+SignedSeed = Annotated[int | None, Option("Random seed, by default 0", 0, 2**53)]
 PassShare = Annotated[float | None, Option("Share of a full pass's paths in each pass", SMALLEST_SHARE, 1)]
 MaxMemory = Annotated[
     float | None, positive_option("Memory for histograms [GB], by default 2; with less, only gates are kept")

@@ -84,13 +84,13 @@ def render_passive(
         A frame's end, as for `render.render` with pixels instead of bins; by default 0.05 within 120 s. `passes` may be
         a list with one number per frame.
     seed
-        Integer from -2^63 to 2^63 - 1, 0 by default; frames and passes have independent random numbers.
+        Integer from 0 to 2^53, 0 by default; frames and passes have independent random numbers.
     frame_step_s
         Time between frames [s], greater than 0, added to the parameter ``surface_time`` of an XML scene, or to a dict's
         ``ocean_surface`` parameter ``time``.
     smooth
-        Standard deviation of a Gaussian that smooths, in each pass, the radiance of paths that the water has scattered
-        on their way to the receiver, 0.2 to 20 pixels; none by default. Reflections, and what is seen without
+        Standard deviation of a Gaussian, 0.2 to 20 pixels; none by default. In each pass it smooths the radiance of
+        paths that the water has scattered on their way to the receiver. Reflections, and what is seen without
         scattering, stay sharp. The attribute ``smoothing_bias`` estimates the relative change, rms over the pixels.
 
     Returns
@@ -99,7 +99,7 @@ def render_passive(
         ``radiance`` and ``radiance_stderr`` [W m^-2 sr^-1 nm^-1] over (row, column) or (pixel,). Several frames come
         first, over ``frame`` with its coordinate ``time_s`` [s]. A filter adds ``background_power`` [W], which the
         receiver detects without its laser. ``etendue`` [m^2 sr] is open area times pixel solid angle times the
-        transmittance of optics and (one way) air; power is radiance times etendue times filter width. The attribute
+        transmittance of optics and (one way) air. Power is radiance times etendue times filter width. The attribute
         ``background_radiance`` is the mean over the field of view. After Ctrl-C it includes the frames that were begun,
         and the attribute ``interrupted`` is 1.
 

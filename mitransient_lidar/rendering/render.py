@@ -90,7 +90,7 @@ def render(
         Longest time for the passes [s], greater than 0. At least two passes are rendered; where full ones would take
         longer, with fewer paths (the attribute ``pass_share``).
     seed
-        Integer from -2^63 to 2^63 - 1, 0 by default; the same seed gives the same result on the same machine.
+        Integer from 0 to 2^53, 0 by default; the same seed gives the same result on the same machine.
     max_memory
         Memory for histograms, means and errors [GB], greater than 0; 2 by default. If a scene with gates exceeds it,
         only the gates are kept, with a warning. For images it is the whole of the process, and passes render tiles of
@@ -150,7 +150,7 @@ def render(
     -----
     Standard errors come from the passes' spread. Intervals by Student's t have ``passes`` minus 1 degrees of freedom.
     Their coverage is nominal where the error is below a tenth of the value. Where it is 20 to 40 %, 95 % intervals from
-    8 passes contain the mean in 91 to 93 % of the bins; in fewer where it is larger.
+    8 passes contain the mean in 91 to 93 % of the bins. Where it is larger, fewer bins do.
     """
     derivatives = [derivatives] if isinstance(derivatives, str) else derivatives
     options = {name: value for name, value in locals().items() if name in engine.RenderOptions.__dataclass_fields__}

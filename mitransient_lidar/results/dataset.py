@@ -1,7 +1,7 @@
 """Labelled results, and their files.
 
 A result is an `xarray.Dataset` with the variables ``impulse_response`` [J per bin] and ``waveform`` [W] and their
-standard errors ``impulse_response_stderr`` and ``waveform_stderr``, over the dimensions (pixel, time), or (row, column,
+standard errors ``impulse_response_stderr`` and ``waveform_stderr``. Dimensions are (pixel, time), or (row, column,
 time) for an imager. The coordinates are ``time`` [ns] at the bin centres, ``pixel`` (names), and the pixel centres in
 tangent-plane angles, ``angle_x`` and ``angle_y`` [mrad]. The render parameters are attributes, among them the scene and
 all its plugin parameters (`loading.scene_source`), from which it can be rendered again. A shot series has the dimension
@@ -106,7 +106,7 @@ def add_derivatives(
 
     `dataset`: the result. `names`, `values`, `units`, `methods`: for each parameter: unique name, value at which the
     light was rendered, unit, and ``score`` or ``central differences``. `arrays`: the four arrays in `build`,
-    differentiated by the parameter in its unit, shape (parameter, pixel, time); in a series with the shots after the
+    differentiated by the parameter in its unit, shape (parameter, pixel, time). In a series, the shots follow the
     parameters.
     """
     coords = {

@@ -311,7 +311,7 @@ def read(path: Path) -> xr.Dataset:
     text = parts[0].attributes.get(_EXACT, "null")
     exact = parse_json(text, f"the header attribute {_EXACT} of {path}")
     if not isinstance(exact, dict):
-        raise UserError(f"{path} is an OpenEXR file, but not a result of mitransient-lidar.")
+        raise UserError(f"{path} is an OpenEXR file, but not a result of mitransient-lidar")
     try:
         kind = _kind(exact.get("content", ""), exact["variables"])
         images = _of_layers(path, parts) if kind is None else _of_images(path, parts, exact, kind)

@@ -44,8 +44,8 @@ _ROUNDING = 1e-2  # of a converter step, by which a signal may differ from a cod
 def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a dataset to a NetCDF-4 file; an existing one is overwritten.
 
-    HDF5 ends the process where the disk is full: files go by way of memory, and the disk space of large ones is
-    reserved first. Signals behind a converter are written as its codes. Raises `ValueError` if an attribute is no
+    HDF5 ends the process where the disk is full. Files therefore go by way of memory, and the disk space of large ones
+    is reserved first. Signals behind a converter are written as its codes. Raises `ValueError` if an attribute is no
     number, text or list of one of these. Raises `OSError` if the file cannot be written.
     """
     import h5netcdf
@@ -192,8 +192,8 @@ Given = Union["xr.Dataset", str, os.PathLike[str]]
 def open(path: str | os.PathLike[str], **selection: Any) -> xr.Dataset:
     """Read a dataset into memory from a file that `save` wrote, or from a folder with a gate sequence.
 
-    Other programs' waveforms over time are read from NetCDF-4 files, too. The content shows the format, not the name;
-    but .las, .laz, .pls and .wvs files are read by `waveform_files.read_waveforms`, with its `selection`.
+    Other programs' waveforms over time are read from NetCDF-4 files, too. The content shows the format, not the name.
+    Only .las, .laz, .pls and .wvs files are read by `waveform_files.read_waveforms`, with its `selection`.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Gate stacks: each pixel's energy in each gate, as a labelled dataset.
 
-A gate stack is an `xarray.Dataset` with ``gate_energy`` and ``gate_energy_stderr`` [J], the energy that a pixel
+A gate stack is an `xarray.Dataset` with ``gate_energy`` and ``gate_energy_stderr`` [J]. This is the energy that a pixel
 collects while a gate is open, summed over the gate's pulses. Dimensions are (row, column, gate) for imagers and (pixel,
 gate) otherwise. Coordinates are the pixels' own, ``gate`` (0, 1, ...), and ``gate_start`` and ``gate_width`` [ns]
 between half heights. ``gate_depth`` is the depth [m] of the gate's middle on the receiver's axis, NaN where the surface
@@ -233,7 +233,7 @@ def check_stack(dataset: xr.Dataset, place: object = "the gate stack") -> xr.Dat
 def as_stack(dataset: xr.Dataset) -> xr.Dataset:
     """Return gates to draw and to analyse as a gate stack, with a name and unit for ``gate_energy`` in its attributes.
 
-    Camera frames become their mean above the dark level [DN], with this mean's standard error; a stack with a sea for
+    Camera frames become their mean above the dark level [DN], with this mean's standard error. A stack with a sea for
     each frame becomes the mean over the frames. Raises `UserError` as for `check_stack`.
     """
     if not has_frames(dataset):

@@ -1,6 +1,6 @@
 """16-bit images for other programs: the gates in a stack, and camera frames, as TIFF and PNG.
 
-A frame keeps its digital numbers. Energies are numbers from 0 to 65535, the largest finite one in the stack; the
+A frame keeps its digital numbers. Energies are numbers from 0 to 65535, the largest finite one in the stack. The
 description states the energy per number [J]. Pixels without a grid form an image one row high. A TIFF file has one page
 for each frame and gate, all gates in the first frame first; PNG files are numbered, ``<name>_gate000.png``, for several
 frames ``<name>_frame0000_gate000.png``. Each has a description in JSON: ``frame`` and ``gate``, its ``gate_start_ns``

@@ -66,9 +66,9 @@ def waveform_chunks(
         First one, and the one after the last or None. Their numbers are in the points' order, for PulseWaves in the
         pulses', from 0.
     channel : int or str, optional
-        Channel, all by default: the scanner channel of point formats 9 and 10, the user data of 4 and 5, the channel of
-        PulseWaves' sampling. ``'FIELD=VALUE'`` is a value in another field of the points, such as ``user_data``,
-        ``pixel`` or ``descriptor``, the wave packet descriptor's index.
+        Channel, all by default. It is the scanner channel of point formats 9 and 10, the user data of 4 and 5, and the
+        channel of PulseWaves' sampling. ``'FIELD=VALUE'`` is a value in another field of the points, such as
+        ``user_data``, ``pixel`` or ``descriptor``, the wave packet descriptor's index.
     lidar : mapping of str to float, optional
         Attributes that the file does not have, from `STATED`: ``sea_level`` is the mean sea level's height in the
         file's coordinates [m], by default the height of each waveform's first return.

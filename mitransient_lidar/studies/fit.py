@@ -91,7 +91,7 @@ def fit(
         float | None, positive_option("Try no step after this many seconds, so that the fit may not converge")
     ] = None,
     seed: Annotated[
-        int | None, Option("Seed of all renders, by default 1, or for a result its own plus 1", -(2**63), 2**63 - 1)
+        int | None, Option("Seed of all renders, by default 1, or for a result its own plus 1", 0, 2**53)
     ] = None,
     most_renders: Annotated[int, Option("Renders after which the fit ends without convergence", 2, 10_000)] = 60,
     progress: ProgressCallback | None = None,

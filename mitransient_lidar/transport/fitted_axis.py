@@ -123,8 +123,8 @@ def _light_under_water(
     """Return the same for a lidar under water, and when the sea first reflects beam or view totally [ns].
 
     The first light is scattered at the lidar. The last light is the farthest echo in beam and view, plus a quarter of
-    its time and 40 ns for multiply scattered light. If nearer, it comes from the range where the water's signal, exp(-2
-    K s) by the column's least diffuse attenuation K, has fallen to 1e-6.
+    its time and 40 ns for multiply scattered light. If nearer, it comes from the range where the water's signal has
+    fallen to 1e-6. The signal is exp(-2 K s) with the column's least diffuse attenuation K.
     """
     view = Rays.of_view(scene, SensorSampler(scene.receiver, transmitter))
     beam = Rays.of_beam(scene, transmitter)

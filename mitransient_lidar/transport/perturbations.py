@@ -2,7 +2,7 @@
 
 A path has lengths L in the layers, n scattering events by the angles theta and m reflections by a solid. It contributes
 in proportion to exp(-c L) b^n times the product of p(theta) and reflectance^m. Its logarithm is a sum over the path,
-and so is its derivative: -L by c (b fixed), n / b by b (c fixed), and so on. The contribution's derivative is
+and so is its derivative. It is -L by c (b fixed), n / b by b (c fixed), and so on. The contribution's derivative is
 contribution times sum, from the same paths (perturbation Monte Carlo: Hayakawa et al. 2001, doi:10.1364/OL.26.001335).
 The weights between techniques that find the same path add up to 1 in any water, and are not differentiated.
 """

@@ -42,8 +42,8 @@ Vector = TypeVar("Vector", mi.Vector3f, mi.Point3f, mi.Normal3f)
 class ScenePart:
     """Shapes that shots meet at a place of their own.
 
-    Points in the lidar's frame are turned about the vertical, by an angle with cosine and sine `turn`, and then
-    displaced [m] to the shapes. Without `turn` they are only displaced.
+    Points in the lidar's frame are turned about the vertical and then displaced [m] to the shapes. The cosine and sine
+    of the angle are `turn`. Without `turn` they are only displaced.
     """
 
     OF_SHOTS = ("displacement", "turn")
@@ -195,9 +195,9 @@ class WaterScene:
     def facet_size(self) -> float:
         """Length over which slopes of the sea surface change [m].
 
-        A quarter of the shortest waves that the beam needs or, if longer, the cell side; in other plugins' meshes the
-        mean side of a cell, a triangle pair. Shorter waves for an image's pixels, and cells finer than their waves, do
-        not count.
+        A quarter of the shortest waves that the beam needs or, if longer, the cell side. In other plugins' meshes it is
+        the mean side of a cell, a triangle pair. Shorter waves for an image's pixels, and cells finer than their waves,
+        do not count.
         """
         sizes = [
             max(surface.sea.cell_size, _FACET_PER_WAVE * surface.sea.beam_wave)
@@ -366,7 +366,7 @@ class WaterScene:
     def spawn_ray(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
         """Return rays that leave surfaces, from points beside them so that they do not meet these again.
 
-        Mitsuba's own offset grows with the distance from the world's origin: 250 m away it is 2 cm, and a path to a
+        Mitsuba's own offset grows with the distance from the world's origin. At 250 m it is 2 cm, and a path to a
         bottom and back loses 0.2 ns. This offset grows with the distance from the scene's reference point, and with
         coordinate rounding.
         """

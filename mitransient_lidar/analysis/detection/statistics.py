@@ -53,7 +53,7 @@ def binomial_rates(successes: npt.ArrayLike, trials: int, confidence: float = 0.
 def exceedance(values: npt.ArrayLike, thresholds: npt.ArrayLike, confidence: float = 0.95) -> Rates:
     """Return the share of values, shape (trials,), above thresholds, shaped as `thresholds`.
 
-    For shots without a target these are false alarm probabilities, with a target detection probabilities; both at one
+    For shots without a target these are false alarm probabilities, with a target detection probabilities. Both at one
     threshold are a point on the receiver operating characteristic. The thresholds must not depend on the values;
     otherwise the intervals of `binomial_rates` are too narrow.
     """
@@ -288,7 +288,7 @@ class Cases:
     def statistic(self) -> Statistic:
         """Return the best weighted sum of the samples, and its distribution.
 
-        One case is weighted for its noise alone; at least three for noise and clutter, with each case's weights
+        One case is weighted for its noise alone. Three or more are weighted for noise and clutter, each with weights
         estimated from the others. Few seas do not determine a weight for every sample. Each detector's samples are
         therefore weighted for its noise and the strongest component of its clutter, and then the detectors for noise
         and their common clutter. Raises `UserError` if the target changes no sample.

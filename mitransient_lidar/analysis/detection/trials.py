@@ -54,9 +54,9 @@ class Level:
 class Experiment:
     """A scene's mean light on its pixels, and the receiver that records it.
 
-    `background` and `difference` are the power without the target, and the power that the target adds [W], shape
-    (renders, pixels, time), from different `seas` or one. `sky` is the steady power on each pixel [W], `samples` are
-    the samples about the target's echo, and `brightest` is the index of the pixel with the strongest echo.
+    `background` is the power without the target, and `difference` the power that the target adds [W], shape (renders,
+    pixels, time). They come from different `seas` or one. `sky` is the steady power on each pixel [W], and `samples`
+    are the samples about the target's echo. `brightest` is the index of the pixel with the strongest echo.
     """
 
     background: FloatArray

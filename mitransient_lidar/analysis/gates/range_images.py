@@ -78,7 +78,7 @@ def range_from_gates(
     a target may end the column. Energies below their error are replaced by it.
 
     Echo: the gate with the largest excess over the column. It must exceed the column by 4 standard errors or be at
-    least half as significant as the most significant gate, which excludes the bright column's noise near the surface.
+    least half as significant as the most significant gate. This excludes the bright column's noise near the surface.
     The depth is the centroid of the excess within `reach`. Its error assumes independent errors and gates not wider
     than the pulse; an echo's position within a wider gate is unknown.
 

@@ -1,8 +1,8 @@
 """Weighted nonlinear least squares for waveforms, with the model's exact derivatives.
 
-Scale and time offset of uncalibrated waveforms are parameters like the others, not projected out, so that bounds,
-weights and the covariance treat all parameters alike. They start at the time with the largest model correlation and at
-the linear least-squares scale. Positive parameters are fitted as logarithms.
+Scale and time offset of uncalibrated waveforms are parameters like the others and not projected out. Bounds, weights
+and the covariance treat all parameters alike. They start at the time with the largest model correlation and at the
+linear least-squares scale. Positive parameters are fitted as logarithms.
 """
 
 from __future__ import annotations

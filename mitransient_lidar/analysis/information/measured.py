@@ -211,8 +211,8 @@ def _recorded(
 ) -> Prediction:
     """Return the mean record of light, shape (pixel, time), with derivatives and errors, by the receiver's closed form.
 
-    Errors in a render's neighbouring bins agree in sign, so that they are propagated as one change in the light, as is
-    each pass batch's deviation.
+    Errors in a render's neighbouring bins agree in sign. They are propagated as one change in the light, like each pass
+    batch's deviation.
     """
     largest = np.abs(slopes).max(axis=-1, keepdims=True, initial=0)
     reach = np.divide(_STEP * light.max(), largest, out=np.zeros_like(largest), where=largest > 0)
@@ -266,10 +266,10 @@ def batch_deviations(dataset: xr.Dataset, dims: tuple[str, ...]) -> FloatArray |
 def correlation(attributes: Any) -> FloatArray:
     """Return the correlation between a render's bin errors by their distance in bins, shape (lags,).
 
-    The pulse smooths bin errors, so that neighbours agree. The attribute ``error_inflation`` is the ratio of two
-    standard deviations for means over n = 1, 2, 4, ... bins: the actual one and the one for independent bins. Its
-    square is f(n)^2 = 1 + 2 sum (1 - k/n) r(k) over the lags 0 < k < n. It is solved for r constant between these
-    numbers of bins. Without it, bins are independent.
+    The pulse smooths bin errors, so that neighbours agree. The attribute ``error_inflation`` compares means over n = 1,
+    2, 4, ... bins: it divides their standard deviation by the one for independent bins. Its square is f(n)^2 = 1 + 2
+    sum (1 - k/n) r(k) over the lags 0 < k < n. It is solved for r constant between these numbers of bins. Without it,
+    bins are independent.
     """
     bins, inflation = (np.atleast_1d(attributes.get(name, ())) for name in ("error_inflation_bins", "error_inflation"))
     found = [1.0]

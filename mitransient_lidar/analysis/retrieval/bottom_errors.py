@@ -76,8 +76,8 @@ def loss_error(
 ) -> float:
     """Return the method's error in the optical depth of both ways to the bottom [1], infinite if unknown.
 
-    The loss assumes homogeneous water. Two signs that the water differs below count in full: the loss by two
-    exponentials (`column_fits.change_points`), and the logarithm of the signal before the bottom echo over the
+    The loss assumes homogeneous water. Two signs that the water differs below count in full. One is the loss by two
+    exponentials (`column_fits.change_points`), the other the logarithm of the signal before the bottom echo over the
     column's. From each its value for homogeneous water is subtracted. Both are means over the shots, in the same water.
 
     Waveforms are of one pixel, as is their table from `echo_table.extract` with `layers`. Bottom depths and one-way
@@ -134,11 +134,11 @@ def whole_energy(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the energies of bottom echoes with their tails, and their errors by noise [J].
 
-    Light that the water scatters forwards arrives later, up to four echo widths: 1 to 7 % of the bottom's energy is not
-    in the Gaussian fitted to the echo. The signal sum about the echo contains all of it. The column before the echo,
-    and its late light after it, are subtracted. The Gaussian counts where noise makes the sum less certain than 10 %,
-    or there is no column. It also counts where the sum would reach beyond the record, or another echo is less than four
-    echo widths before the bottom's.
+    Light that the water scatters forwards arrives up to four echo widths later. The Gaussian fitted to the echo
+    therefore lacks 1 to 7 % of the bottom's energy. The signal sum about the echo contains all of it. The column before
+    the echo, and its late light after it, are subtracted. The Gaussian counts where noise makes the sum less certain
+    than 10 %, or there is no column. It also counts where the sum would reach beyond the record, or another echo is
+    less than four echo widths before the bottom's.
 
     Parameters as for `loss_error`.
     """
@@ -201,7 +201,7 @@ def sea_variances(
     """Return whether slopes and ranges from `surface_slopes` lower the variances of depth and log reflectance.
 
     Also return these variances without and with them, [m^2] and [1]. The former depth variance is infinite if the sea
-    is unknown; the reflectance variance is then the value over a typical sea.
+    is unknown. The reflectance variance is then the value over a typical sea.
     """
 
     def through(along: FloatArray, across: FloatArray, distance: FloatArray) -> tuple[FloatArray, SlopeRefraction]:

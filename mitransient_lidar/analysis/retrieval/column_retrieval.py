@@ -141,10 +141,10 @@ class WaterEstimate:
 def water_of_column(decay: npt.ArrayLike, backscatter: npt.ArrayLike, excess: float, level: float) -> WaterEstimate:
     """Estimate absorption, backscattering, Kd and bounds of c from a column in a wide view.
 
-    The attenuation K along the path is that in the column's signal, exp(-2 K s) [1/m]. The backscatter b p(pi) includes
-    multiple scattering [1/(m sr)]: it is the power at the surface, extrapolated with K, over `LidarSystem.column_gain`
-    and the fraction of the beam in view. `excess` is K minus the absorption [1/m], and `level` the backscatter over
-    bb/(2 pi), from `scattered_light.ScatteredLight`.
+    The attenuation K along the path is that in the column's signal, exp(-2 K s) [1/m]. The backscatter b p(pi) [1/(m
+    sr)] includes multiple scattering. It is the power at the surface, extrapolated with K, over
+    `LidarSystem.column_gain` and the fraction of the beam in view. `excess` is K minus the absorption [1/m], and
+    `level` the backscatter over bb/(2 pi), from `scattered_light.ScatteredLight`.
 
     Kd follows Lee, Du and Arnone (2005), doi:10.1029/2004JC002275. c is ill-posed: the signal hardly depends on forward
     scattering. The estimate is a + bw + (bb - bw/2)/r, with the scattering bw by sea water at 532 nm. It is given for

@@ -1,7 +1,7 @@
 """Light that water scatters forwards, in a column's signal and in a bottom's echo.
 
-Column and bottom do not decay alike. Light that forward scattering has turned from its ray meets more water per depth
-and returns by other angles than 180 degrees: the column gains on the bottom with depth. Light from both leaves the
+Column and bottom do not decay alike. Light that forward scattering has turned from its ray meets more water per depth.
+It returns by other angles than 180 degrees, and the column gains on the bottom with depth. Light from both leaves the
 field of view. `physics.lidar.echo_estimate` gives both signals for a water; this module finds the water whose column
 has a measured level and decay.
 """

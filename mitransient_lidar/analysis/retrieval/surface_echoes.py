@@ -156,8 +156,8 @@ def sea_shots(lidar: SeaLidar, wind_speed: float, wind_direction: float, *, seed
     A horizontal area dA sends the energy Q A p F(0) D dA/(4 n_z R^4) back to the aperture A. Here Q p is the beam's
     energy per solid angle, R the distance, n_z the vertical component of the facet normal, and F the Fresnel
     reflectance. Ripple normals have the distribution D = exp(-s_u^2/(2 v_u) - s_c^2/(2 v_c)) / (2 pi sqrt(v_u v_c)
-    cos^4) about the facet's, for ray slopes s against the facet and ripple slope variances v. See Walter, Marschner, Li
-    and Torrance 2007, doi:10.2312/EGWR/EGSR07/195-206, eq. 20 and 25, without masking.
+    cos^4) about the facet's. Here s are ray slopes against the facet, and v ripple slope variances. See Walter,
+    Marschner, Li and Torrance 2007, doi:10.2312/EGWR/EGSR07/195-206, eq. 20 and 25, without masking.
     """
     wind = in_range("wind_speed", wind_speed, LEAST_WIND_SPEED, MAX_WIND_SPEED)
     spectrum = MatchedSpectrum(ElfouhailySpectrum(wind, direction=wind_direction), *cox_munk(wind))

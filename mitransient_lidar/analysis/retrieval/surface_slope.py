@@ -1,8 +1,8 @@
 """Sea surface slope from times and strengths of one shot's surface echo, and corrections of a bottom echo for it.
 
-Slopes are rises over runs, positive `along` the lidar's azimuth for a face towards the lidar, and `across` for a rise
-to the left (+angle_y). `slopes_on_sea` uses a sea's statistics, `fit_plane` times alone, for any surface. Its plane is
-at the distance rho along the receiver's axis, with 1/rho = A + B angle_x + C angle_y.
+Slopes are rises over runs. A face towards the lidar is positive `along` the lidar's azimuth, and a rise to the left
+(+angle_y) is positive `across`. `slopes_on_sea` uses a sea's statistics, `fit_plane` times alone, for any surface. Its
+plane is at the distance rho along the receiver's axis, with 1/rho = A + B angle_x + C angle_y.
 """
 
 from __future__ import annotations
@@ -107,13 +107,13 @@ def fit_plane(
     Assumptions: transmitter and receiver at one location; each pixel's echo comes from the centroid of its light; the
     surface is plane within the footprint. Short waves violate the last two, since few facets anywhere in a pixel face
     the lidar. This error dominates the noise. A centre error d changes the range by the relative amount tan(off_nadir -
-    tilt) d; the face's tilt is assumed to be half the estimate, with this uncertainty. Hence faces away from the lidar
+    tilt) d. The face's tilt is assumed to be half the estimate, with this uncertainty. Hence faces away from the lidar
     have larger errors. Errors in adjacent pixels, which the same crests cross, have a correlation of 0.4 that falls
     with the distance in angle_x as exp(-dx^2/(2 spread^2)). It raises the error along and lowers the error across. One
     facet per pixel and 0.4 come from 600 rendered shots at 6 m/s along the wind, 20 degrees off nadir, views of 15 and
     30 mrad. Pixel centres had errors of 0.85 to 1.13 spreads, with correlations of 0.30 to 0.43 between adjacent pixels
     and -0.24 to 0.18 otherwise. The rms ratio of error to stated error is 1.04 to 1.28 along, 0.78 to 0.91 across, and
-    0.86 to 1.00 with a prior; in 120 shots across the wind, 0.81 to 1.24.
+    0.86 to 1.00 with a prior. In 120 shots across the wind, it is 0.81 to 1.24.
 
     Pixels narrow in angle_x are best, since it determines the time. Pixels that cut a wide beam have skewed light, and
     a symmetric echo fit lies too near to the axis. A level sea then appears to face the lidar by up to 1.5 degrees.
@@ -241,19 +241,19 @@ def slopes_on_sea(echoes: PixelEchoes, shots: SeaShots, scale: float | None) -> 
     Observations are each pixel's time, which measures the mean plane by its distance, and its strength as the deviation
     u = sqrt(2 ln(E_0/(E + e))). The echo energy E is proportional to the density of specular slopes. It is
     exp(-(tan(theta) - along)^2/(2 v)) for Gaussian slopes with the variance v within the footprint (Cox and Munk 1954,
-    doi:10.1364/JOSA.44.000838), so that u is linear in the slope along. E_0 is 2.7 times the largest energy in `shots`,
+    doi:10.1364/JOSA.44.000838). Thus u is linear in the slope along. E_0 is 2.7 times the largest energy in `shots`,
     and e a quarter of the column's energy, where echo fits become uncertain. A pixel without an echo has the strength 0
     +- e.
 
     Fit errors are 0.25 of the energy and e. In time they are 0.03 echo widths, and 1.5 spreads of the light over the
     pixel for echoes far fainter than 0.4 column energies. These were measured on one sea (6 m/s, 5 ns pulses, column
-    with c = 0.3 1/m); e scales with the column in other waters.
+    with c = 0.3 1/m). In other waters, e scales with the column.
 
     Stated errors hold over all shots on a sea. In 200 others each at 3, 6 and 10 m/s, 20 degrees off nadir, the rms
     ratio of error to stated error was 0.88 to 1.06 along and 0.89 to 1.04 across. The correlation with the true slope
-    along was 0.63, 0.88 to 0.92 and 0.96 for 2x2 pixels, and 0.71, 0.92 to 0.94 and 0.97 for 1x4. They do not hold for
-    each slope. At 6 m/s, faces away by more than 5 degrees, whose echoes the column hides, are estimated as about 4
-    degrees, with 1.6 to 1.9 times the stated errors.
+    along was 0.63, 0.88 to 0.92 and 0.96 for 2x2 pixels. For 1x4 pixels it was 0.71, 0.92 to 0.94 and 0.97. They do not
+    hold for each slope. At 6 m/s, the column hides the echoes of faces away by more than 5 degrees. They are estimated
+    as about 4 degrees, with 1.6 to 1.9 times the stated errors.
     """
     truth = np.stack([shots.along, shots.across, shots.height], axis=1)
     energy = np.maximum(np.nan_to_num(echoes.energy), 0)

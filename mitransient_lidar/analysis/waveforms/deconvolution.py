@@ -32,7 +32,7 @@ def richardson_lucy(
     """Deconvolve waveforms by the iteration of Richardson (1972) and Lucy (1974).
 
     x <- x K^T[(y + o)/(K x + o)]/K^T[1], where y are the samples, K is the convolution with the pulse and o >= 0 an
-    offset. The iteration is derived for counting noise; an offset equal to the variance of additional Gaussian noise
+    offset. The iteration is derived for counting noise. An offset equal to the variance of additional Gaussian noise
     accounts for that (Snyder, Hammoud and White 1993). The result is never negative. Each iteration resolves shorter
     structure, including that of the noise.
 
@@ -98,9 +98,9 @@ def deconvolved_echo(
 
     Time and width are the first two moments of the deconvolved record within three quarters of an echo width about its
     maximum near `bins`. The energy is its integral. Errors are those of a maximum-likelihood fit to one such echo, for
-    the given noise. The scatter after few iterations agrees with them within a fifth in time and energy; that of the
-    width is smaller, by up to three quarters. The amplitude belongs to an echo with this energy and the pulse width;
-    the width excludes the pulse.
+    the given noise. The scatter after few iterations agrees with them within a fifth in time and energy. The scatter of
+    the width is smaller, by up to three quarters. The amplitude belongs to an echo with this energy and the pulse
+    width; the width excludes the pulse.
 
     The other arguments are the waveforms, peak bins and `EchoFlag` of the echoes, shape (n,), the ideal echo's shape,
     and the expected echo width in the records [ns].

@@ -92,7 +92,7 @@ def correct_depths(found: Given, table: Given, wind_speed: float | None = None, 
         variance of ripples replaces the wind. The attenuation (`usual_attenuation`) is compared among columns as long.
         Outside the table they are those of its ends, but spreads that grow with the angle or the wind go on growing.
         Where the column has no attenuation, the mean over waters counts, each with its share of bottoms found at this
-        depth; only table depths without attenuation are used. Where it has one, only depths with it are used. A bias
+        depth. Only table depths without attenuation are used. Where it has one, only depths with it are used. A bias
         counts with the share bias^2/(bias^2 + spread^2/n), for n places of a sea.
 
         ``depth_m_method_error`` is the root sum square of
@@ -112,14 +112,14 @@ def correct_depths(found: Given, table: Given, wind_speed: float | None = None, 
     Notes
     -----
     The linear interpolation of a random walk between nodes at the distances g and h has the variance rate times g h/(g
-    + h), and beyond an end rate times g (kriging with a linear variogram; G. Matheron, Principles of geostatistics,
-    Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is a mean over the
-    lowest-wind cells in which half of the shots have a depth. Each node is left out in turn; its squared difference
-    from the interpolated neighbours is divided by g h/(g + h). Two nodes give 0.47 of their squared difference over the
-    distance, the mean ratio of both rates in eight tables (0.57 +- 0.12 in the shipped ones); one node gives 0, one
-    wind of ripples 0.44 cm^2 for each unit of the inverse slope variance, the mean of the tables. Rates along wind and
-    ripples exclude the variance of location means. Cells in which fewer of the shots have a depth count only where no
-    other ones do. Without any bias of an estimator in a pixel, depths and errors stay as they are.
+    + h), and beyond an end rate times g (kriging, linear variogram; G. Matheron, Principles of geostatistics, Economic
+    Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is a mean over the lowest-wind
+    cells in which half of the shots have a depth. Each node is left out in turn; its squared difference from the
+    interpolated neighbours is divided by g h/(g + h). Two nodes give 0.47 of their squared difference over the
+    distance. This is the mean ratio of both rates in eight tables (0.57 +- 0.12 in the shipped ones). One node gives 0.
+    One wind of ripples gives 0.44 cm^2 for each unit of the inverse slope variance, the mean of the tables. Rates along
+    wind and ripples exclude the variance of location means. Cells in which fewer of the shots have a depth count only
+    where no other ones do. Without any bias of an estimator in a pixel, depths and errors stay as they are.
     """
     found = dataset_of("found", found, "echoes")
     instrument = str(found.attrs.get("instrument", ""))
@@ -247,9 +247,9 @@ def _of_columns(learnt: xr.Dataset, known: bool) -> xr.Dataset:
 def turned_pixels(learnt: xr.Dataset, angle_x: FloatArray, angle_y: FloatArray, turn_deg: float) -> xr.Dataset:
     """Return a table for pixels that are turned about the receiver's axis.
 
-    A bias depends on the angle between a pixel's place and the plane of incidence. That of a turned pixel is linear in
-    this angle between the two pixels of the table on its ring which are beside it, with weights 1 - w and w, and has
-    the variance w (1 - w) (b_2 - b_1)^2 of their biases b_1 and b_2 besides theirs.
+    A bias depends on the angle between a pixel's place and the plane of incidence. A turned pixel lies between two
+    table pixels on its ring. Its bias is linear in this angle between their biases b_1 and b_2, with weights 1 - w and
+    w. Besides their variances it has the variance w (1 - w) (b_2 - b_1)^2.
 
     `learnt`: table over ``pixel``, with the variables ``bias`` and ``variance`` [m^2]. `angle_x`, `angle_y`: pixel
     centres, away from nadir and to the left, in any unit, shape (pixels,). `turn_deg`: angle from far to left [deg].

@@ -191,7 +191,7 @@ class DepthErrors:
         """Return the errors of depths [m], shape (n, ...), in pixels without direct light, shape (n,), 0 in others.
 
         Light that is scattered to such a pixel, at the distance r from the beam's axis, has slant paths to the bottom
-        and back, by sqrt(d^2 + r^2) - d longer than the depth d. The distance is that at which a Gaussian beam has the
+        and back. They exceed the depth d by sqrt(d^2 + r^2) - d. The distance is that at which a Gaussian beam has the
         pixel's share of the brightest pixel's light, stored to 9 decimals.
         """
         share = np.nan_to_num(self.lines.beam_share)

@@ -84,8 +84,8 @@ class Records:
     def of(cls, waveforms: npt.ArrayLike, time_ns: npt.ArrayLike, noise: npt.ArrayLike = 0.0) -> Records:
         """Check waveforms, shape (n, time), at bin centres [ns], at least 8, evenly spaced and increasing.
 
-        The samples' standard deviation, shape (), (n,) or (n, time), not negative, is at least a millionth of the
-        record's largest sample: weights are finite. Invalid arrays raise `UserError`.
+        The samples' standard deviation has the shape (), (n,) or (n, time) and is not negative. At least a millionth of
+        the record's largest sample keeps weights finite. Invalid arrays raise `UserError`.
         """
         power, time, sigma = (
             finite_array(name, values)
@@ -258,10 +258,10 @@ def find_echoes(
     v^0.4, with the mean v of w from t+d to t+2d. An exponential exceeds none: neither the column nor a step down in it
     is a peak. Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom,
     earlier ones are targets. Peaks below two thirds of what follows the last one are none. Peaks below a fiftieth of
-    the strongest are ignored; among peaks less than an echo width apart the strongest counts. Behind the upper edge of
-    a turbid layer the signal does not fall back to the column above it: such a rise is no echo. Nor is a first
-    summit four times as wide as an echo in a record without a surface echo: light that was scattered to a pixel beside
-    the beam rises and falls slowly. Waves focus a shot's light, so that its column has peaks. Under waves, targets rise
+    the strongest are ignored; among peaks less than an echo width apart the strongest counts. After the upper edge of a
+    turbid layer the signal does not fall back to the column above it. Such a rise is no echo. Nor is a first summit
+    four times as wide as an echo in a record without a surface echo: light that was scattered to a pixel beside the
+    beam rises and falls slowly. Waves focus a shot's light, so that its column has peaks. Under waves, targets rise
     above the column by at least half of it, and near the surface also above half the column after them.
 
     Parameters
@@ -387,7 +387,7 @@ def _is_edge(
 ) -> BoolArray:
     """Return which peaks are rises of the column: behind them the signal stays above the column before, and only falls.
 
-    An echo of a Gaussian pulse has fallen to a twentieth within 0.8 reaches, others to their `tail`; between two echoes
+    An echo of a Gaussian pulse has fallen to a twentieth within 0.8 reaches, others to their `tail`. Between two echoes
     the signal rises again.
     """
     edges = np.zeros_like(peaks)

@@ -55,8 +55,8 @@ def gaussian_surface(
     surface, and p the time for an echo with the found peak. E is the ideal echo shape, blurred by a Gaussian with free
     width, and F the focusing by waves. It is fitted from two echo widths before the peak to two after it, and
     determines the surface even where the peak is that of the column. Amplitude, energy and width are those of A E. A
-    single shot's focusing differs from its mean. Over waves, samples later than an echo width after the rise to C / 2
-    therefore have a relative error of 0.8, unless the peak is above 10 C.
+    single shot's focusing differs from its mean. Over waves, samples more than an echo width after the rise to C / 2
+    therefore have a relative error of 0.8. Peaks above 10 C are excepted.
 
     A surface echo that is weak relative to the column is fitted nearly as well without A, one or two nanoseconds
     earlier. Where A lowers the squared residuals by less than 9, the result is the mean over fits with fixed A, 0 to

@@ -123,20 +123,20 @@ def first_echoes(
     All possibilities consist of the known pulse P, blurred by a Gaussian with free width for slopes. Its integral
     stands for a column with constant backscattering. Land is A P(t - t1). A surface is A P(t - t1) and a column from t1
     on, which decays. A bottom at t1 + d is A P(t - t1 - d), a column from t1 to t1 + d, and its surface echo A' P(t -
-    t1); heights are not negative. Fits keep a column's log decay within about 1 of the typical one. Light that the
+    t1). Heights are not negative. Fits keep a column's log decay within about 1 of the typical one. Light that the
     surface totally reflects meets the bottom again. For a Lambertian bottom with reflectance rho it is 2 rho d^2/u^3
-    per time at u > 1.5 d after the bottom (below a level surface, later passages left out). Samples have their noise
-    and the pulse shape's error, 10 % over waves.
+    per time at u > 1.5 d after the bottom. This leaves out later passages, and holds below a level surface. Samples
+    have their noise and the pulse shape's error, 10 % over waves.
 
     Probabilities follow from Bayes' theorem with these priors. Land and water are as likely. Land heights are uniform
     up to 20 m above the surface, bottom depths up to 10 m. The surface has its level's normal distribution. Three
-    waters in ten show no bottom. Column decays are uniform up to ten times the typical one; their log levels from the
-    clearest water to 150 times as much, or to the peak. Land is thus what stands above the surface, or what has no
-    column where even the clearest water would show one. The next 160 ns behind the samples of the fits count, too: they
-    tell a surface from land, but not from a bottom. A column that a digitiser rounds to nothing does not tell them.
-    Surface and column echoes beside a bottom cost their parameter volume (Laplace's approximation). Depths are means
-    over 32 delays d, up to the surface at 4 standard deviations above its level. Where the surface has its own echo,
-    they follow from the fit of all parameters. Errors include the delays' spread and spacing.
+    waters in ten show no bottom. Column decays are uniform up to ten times the typical one. Their log levels are
+    uniform from the clearest water to 150 times as much, or to the peak. Land is thus what stands above the surface, or
+    what has no column where even the clearest water would show one. The next 160 ns behind the samples of the fits
+    count, too: they tell a surface from land, but not from a bottom. A column that a digitiser rounds to nothing does
+    not tell them. Surface and column echoes beside a bottom cost their parameter volume (Laplace's approximation).
+    Depths are means over 32 delays d, up to the surface at 4 standard deviations above its level. Where the surface has
+    its own echo, they follow from the fit of all parameters. Errors include the delays' spread and spacing.
     """
     level, count = priors.level, len(bins)
     spread = np.maximum(level.stderr_ns, _LEAST_SPREAD)

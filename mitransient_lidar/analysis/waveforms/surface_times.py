@@ -108,8 +108,8 @@ def infrared_level(
     -----
     Green pixels share the surface height over mean sea level in the infrared pixel that has most of the beam. Its error
     stems from the infrared time and both records' triggers and clocks. Waves add the standard deviation of slopes
-    averaged over the green beam, times two lengths: the pixel's distance from the infrared beam, and a quarter of the
-    green beam's diameter for its own mean height. Where it is not known, the level is NaN.
+    averaged over the green beam, times two lengths. These are the pixel's distance from the infrared beam, and a
+    quarter of the green beam's diameter for its own mean height. Where it is not known, the level is NaN.
     """
     dims = tuple(str(dim) for dim in table["surface_time_ns"].dims)
     own = LinesOfSight.from_dataset(infrared, dims)

@@ -131,7 +131,7 @@ def check_hdf5(path: str | os.PathLike[str]) -> None:
     """Raise `UserError` if an HDF5 file takes values or groups from other files, before any is read.
 
     A dataset may have its values in other files ("external storage", which may be a device), or in datasets in other
-    files ("virtual"), and a link may lead into another file.
+    files ("virtual"). A link may lead into another file.
     """
     import h5py
 

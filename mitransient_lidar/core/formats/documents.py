@@ -19,8 +19,8 @@ _NESTED = (list, tuple, Mapping)
 def check_xml(text: str | bytes, name: object) -> None:
     """Raise `UserError` if an XML document is not well-formed, or contains more than elements, attributes and comments.
 
-    A DOCTYPE, its own entities and processing instructions are refused where they begin, before anything is expanded:
-    an entity may become any element, and grow without limit. `name` is the document's name in the message.
+    A DOCTYPE, its own entities and processing instructions are refused where they begin, before anything is expanded.
+    An entity may become any element, and grow without limit. `name` is the document's name in the message.
     """
     parser = expat.ParserCreate()
     parser.StartDoctypeDeclHandler = _refusing(name, "a DOCTYPE")

@@ -67,7 +67,7 @@ def pulse_blocks(path: Path, first: int, end: int | None, size: int) -> Iterator
     8, 16 or 32 bits.
     """
     with open_file(path) as file:
-        with damaged_file(f"{path} is damaged, or is not a PulseWaves file."):
+        with damaged_file(f"{path} is damaged, or is not a PulseWaves file"):
             if not (start := file.read(_HEADER_AT)).startswith(_PULSES):
                 raise ValueError(start)
             after, start, count, _, _, length, packed, _, *records = _HEADER.unpack(file.read(_HEADER.size))
@@ -80,7 +80,7 @@ def pulse_blocks(path: Path, first: int, end: int | None, size: int) -> Iterator
         with PacketFile(waveform_blocks.samples_beside(path, ".wvs", ".wvz")) as packets:
             heading = packets.take(0, waveform_blocks.HEADER, "the header")
             if not heading.startswith(_WAVES):
-                raise UserError(f"{packets.path} is damaged, or is not a PulseWaves file.")
+                raise UserError(f"{packets.path} is damaged, or is not a PulseWaves file")
             waveform_blocks.refuse_compressed(str(packets.path), heading[len(_WAVES)])
             for begin in range(first, last, size):
                 file.seek(start + begin * length)

@@ -82,9 +82,9 @@ def read_table(
 ) -> Table:
     """Read a table from a text file as an instrument or a spreadsheet writes it.
 
-    Above the rows there may be text lines. The first one that names two or more columns is the heading; it may be a
-    comment, and the line below it may give the units. Cells are separated by semicolons, tabs, commas or blanks;
-    between semicolons and tabs, a comma in a number is the decimal point. Comments follow a #, or begin their line with
+    Above the rows there may be text lines. The first one that names two or more columns is the heading. It may be a
+    comment, and the line below it may give the units. Cells are separated by semicolons, tabs, commas or blanks.
+    Between semicolons and tabs, a comma in a number is the decimal point. Comments follow a #, or begin their line with
     %, // or !. Rows with missing values (empty, nan, na, n/a, null, none, dashes) are left out with a warning in the
     log. Raises `UserError` if the file cannot be read or is not text; a name, unit or wavelength is unknown, or a
     column is there twice; or a line does not contain one number for each column.

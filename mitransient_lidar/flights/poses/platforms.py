@@ -11,7 +11,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.options import Option, Plan, of_kind, positive_option
+from mitransient_lidar.core.options import Option, Plan, Seed, of_kind, positive_option
 from mitransient_lidar.core.validation import FloatArray, finite_array
 from mitransient_lidar.flights.poses.records import PlatformPoses, RotationSpec, TimeSystem, time_system
 from mitransient_lidar.flights.poses.trajectory import Interpolation, Trajectory, read_sbet_records, read_text_records
@@ -41,7 +41,7 @@ class AttitudeNoise(Plan):
     pitch_deg: Annotated[float, _Deviation] = 0.0
     yaw_deg: Annotated[float, _Deviation] = 0.0
     correlation_s: Annotated[float, positive_option("Correlation time", "s")] = 5.0
-    seed: Annotated[int, Option("Seed of the random numbers", 0, 2**32 - 1)] = 0
+    seed: Seed = 0
 
     def sample(self, count: int, step_s: float, rng: np.random.Generator) -> FloatArray:
         """Return roll, pitch and yaw [deg] at `count` times that are `step_s` apart, shape (3, count)."""

@@ -32,10 +32,10 @@ def rotation_matrices(
     """Return the matrices that turn body vectors into scene vectors.
 
     ``aerospace`` is yaw . pitch . roll: roll first turns the vector about the forward axis (positive: right side down).
-    Pitch then turns it about the axis to the right (positive: nose up), yaw about the downward vertical (positive:
-    clockwise from above, so that yaw is the heading from north). ``ARINC 705``, the default of HELIOS++, has the same
-    signs but yaw . roll . pitch: pitch acts first. ``CANONICAL`` of HELIOS++ is roll about x, pitch about y and yaw
-    about z, all counterclockwise seen against the axis, with yaw acting first.
+    Pitch then turns it about the axis to the right (positive: nose up). Yaw turns it about the downward vertical
+    (positive: clockwise from above, so that yaw is the heading from north). ``ARINC 705``, the default of HELIOS++, has
+    the same signs but yaw . roll . pitch: pitch acts first. ``CANONICAL`` of HELIOS++ is roll about x, pitch about y
+    and yaw about z, all counterclockwise seen against the axis, with yaw acting first.
 
     `roll_deg`, `pitch_deg`, `yaw_deg`: angles [deg], shape (n,). `rotation_spec`: order of the rotations.
 
@@ -81,8 +81,8 @@ def time_system(time_s: FloatArray, file: str | None = None, *, is_sbet: bool = 
     """Return a platform's time system, where its table does not state it.
 
     Times of a file from 10^7 s on are adjusted GPS times, and from 10^9 s on GPS times. In an SBET file, smaller ones
-    count from a week's start, up to a day after its end; in a text file, from the flight's. Other platforms begin with
-    their flight.
+    count from a week's start, up to a day after its end. In a text file, they count from the flight's start. Other
+    platforms begin with their flight.
 
     Raises UserError if the times may be Unix times.
 

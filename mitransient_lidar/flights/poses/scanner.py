@@ -92,7 +92,7 @@ class Palmer(Scanner):
 class SemiArc(Scanner):
     """Arcs at a constant angle from the nadir, in front of the platform or to one side.
 
-    At phase 0 the beam is in the middle of the arc and moves clockwise; a ``sawtooth`` begins at the counterclockwise
+    At phase 0 the beam is in the middle of the arc and moves clockwise. A ``sawtooth`` begins at the counterclockwise
     end.
     """
 

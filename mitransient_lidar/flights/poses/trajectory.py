@@ -94,7 +94,7 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> PlatformPoses:
 
     A record is 17 little-endian 64-bit numbers: time [s]; WGS 84 latitude and longitude [rad] and ellipsoidal height
     [m]; three velocities; roll, pitch and platform heading [rad]. Then follow wander angle [rad], three accelerations
-    and three angular rates. The true heading is the platform heading less the wander angle; yaw is counted from grid
+    and three angular rates. The true heading is the platform heading minus the wander angle. Yaw is counted from grid
     north, from which true north differs by the meridian convergence.
 
     Raises UserError if the file cannot be read, has more than 1 GiB, or its size is no multiple of 136 bytes. A record
@@ -114,7 +114,7 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> PlatformPoses:
         check_size(path, size, _LARGEST_SBET)
         data = None if size % width else np.fromfile(file, dtype="<f8").reshape(-1, _SBET_NUMBERS)
     if data is None:
-        raise UserError(f"{path} has {size} bytes, but an SBET file must have a multiple of {width}.")
+        raise UserError(f"{path} has {size} bytes, but an SBET file must have a multiple of {width}")
 
     def place(row: int) -> str:
         return f"{path}, record {row + 1}"
@@ -178,8 +178,8 @@ class Trajectory(PlatformPoses):
     """Position and attitude of a platform over time, and its flight lines.
 
     Axes of the platform are x to the right, y forward and z up. Between records, positions and angles are linear in
-    time, or cubic splines (twice differentiable, not-a-knot ends) through records that follow each other within 1 s,
-    and linear elsewhere. Angles take the shorter way round.
+    time, or cubic splines (twice differentiable, not-a-knot ends). Splines pass through records that follow each other
+    within 1 s, with lines elsewhere. Angles take the shorter way round.
 
     `time_s`, `position`, `roll_deg`, `pitch_deg`, `yaw_deg`: the records, 2 or more at strictly increasing times.
     `rotation_spec`: order of the rotations, as in `records.rotation_matrices`. `interpolation`: ``linear``, or

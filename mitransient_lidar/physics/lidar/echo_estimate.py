@@ -1,17 +1,16 @@
 """Fast estimate of the light of homogeneous water and of level bottoms in it, without tracing rays.
 
 Light is the lidar equation's, on the axis of a level sea. Scattering moves and delays it: paths scatter forwards a
-random number of times at random depths, and each event shifts all that follows by the tangent of its angle times the
+random number of times at random depths. Each event shifts all that follows by the tangent of its angle times the
 remaining distance. One scattering by a large angle, or the bottom, turns the path. Shifts on the way down move the
-point that is lit, and with it the time; those on the way up move only the direction from which its light is seen.
+point that is lit, and with it the time. Shifts on the way up move only the direction from which its light is seen.
 
-Directions that forward scattering has spread matter to the water and not to the bottom: per depth, light along a slant
+Directions that forward scattering has spread matter to the water and not to the bottom. Per depth, light along a slant
 meets more water, by 1/cos, and it returns by other angles than 180 degrees. The energy that a level Lambertian bottom
 receives and returns through a horizontal plane is the same for all directions. The signal of a column thus decays more
-slowly than the echoes of bottoms.
-Two-way use of the beam spread function in this way follows Katsev et al. (1997), J. Opt. Soc. Am. A 14, 1338,
-doi:10.1364/JOSAA.14.001338, and Walker and McLean (1999), Appl. Opt. 38, 2384, doi:10.1364/AO.38.002384; angles are
-drawn from the phase function here, since its moments describe sea water badly.
+slowly than the echoes of bottoms. Two-way use of the beam spread function in this way follows Katsev et al. (1997), J.
+Opt. Soc. Am. A 14, 1338, doi:10.1364/JOSAA.14.001338, and Walker and McLean (1999), Appl. Opt. 38, 2384,
+doi:10.1364/AO.38.002384; angles are drawn from the phase function here, since its moments describe sea water badly.
 """
 
 from __future__ import annotations

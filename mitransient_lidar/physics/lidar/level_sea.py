@@ -33,7 +33,7 @@ class LevelSea:
     def lengths(self, depth: ArrayLike, sine: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return the optical length of rays from the sea level to depths, and the horizontal one over the sine [m].
 
-        Depths [m] and sines of the angles from the vertical in the air broadcast; lengths to points in the air are 0.
+        Depths [m] and sines of the angles from the vertical in the air broadcast. Lengths to points in the air are 0.
         """
         depth, sine = np.asarray(depth, dtype=np.float64), np.asarray(sine, dtype=np.float64)
         optical = horizontal = np.zeros(np.broadcast_shapes(depth.shape, sine.shape))
@@ -156,8 +156,8 @@ def fresnel(theta: ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
 def solid_angle_per_area(height: ArrayLike, depth: ArrayLike, theta: ArrayLike, n: float) -> FloatArray:
     """Solid angle in water per receiver area, at a point on the refracted ray.
 
-    Returns d(omega)/dA [sr/m^2] for an aperture normal to the ray: 1/(S_s S_t) with the sagittal and tangential
-    distances S_s = n H/cos(theta) + D/cos(phi) and S_t = n H cos(phi)/cos^2(theta) + D cos(theta)/cos^2(phi).
+    Returns d(omega)/dA [sr/m^2] for an aperture normal to the ray: 1/(S_s S_t) with the sagittal distance S_s = n
+    H/cos(theta) + D/cos(phi). The tangential distance is S_t = n H cos(phi)/cos^2(theta) + D cos(theta)/cos^2(phi).
 
     `height`, `depth`: receiver height and point depth [m]. `theta`, `n`: ray angle in air [rad], and water refractive
     index.

@@ -39,7 +39,7 @@ class Pose:
 
         `altitude`: height above the mean sea level [m], 0.1 to 1e6, or -1000 to -0.1 under water. `off_nadir_deg`: axis
         angle from the downward vertical [deg], 0 to 89.9, or 0 to 180 under water. `aim_x`, `aim_y`: point where the
-        axis meets the mean sea level [m], -1e7 to 1e7; under water the point above the pose.
+        axis meets the mean sea level [m], -1e7 to 1e7. Under water it is the point above the pose.
 
         Values out of range raise UserError.
         """
@@ -61,8 +61,8 @@ class Pose:
     def from_matrix(cls, name: str, matrix: FloatArray) -> Self:
         """Return the pose by a transformation, shape (4, 4), a parameter with this name.
 
-        It maps the local axes as Mitsuba's ``look_at`` with ``up = (0, 0, 1)`` does: z is the optical axis, y is
-        +angle_x (away from nadir) and x is +angle_y. A matrix that is not a rotation, a scale and a translation raises
+        It maps the local axes as Mitsuba's ``look_at`` with ``up = (0, 0, 1)`` does. The optical axis is z, +angle_x
+        (away from nadir) is y, and +angle_y is x. A matrix that is not a rotation, a scale and a translation raises
         UserError.
         """
         lengths = np.linalg.norm(matrix[:3, :3], axis=0)

@@ -74,9 +74,9 @@ class Pulse:
 
         Raises UserError if the file cannot be read, a sample is lower than that, or `sampled` refuses the samples.
 
-        `path`: file for `text_tables.read_time_samples`: times as for `sampled`, and the power in any unit, which may
-        be called power, signal, amplitude, intensity, voltage, counts, W, V or mV, among others. Samples below 0, down
-        to -0.1 times the largest one, are noise and set to 0 with a warning in the log.
+        `path`: file for `text_tables.read_time_samples`: times as for `sampled`, and the power in any unit. Its name
+        may be power, signal, amplitude, intensity, voltage, counts, W, V or mV, among others. Samples below 0, down to
+        -0.1 times the largest one, are noise and set to 0 with a warning in the log.
         """
         times, power = read_time_samples(path, _POWER)
         lowest = power.min(initial=0.0)

@@ -36,8 +36,8 @@ class TimeAxis:
     ) -> TimeAxis:
         """Return the bins for times from `first_ns` to `last_ns` [ns].
 
-        Start and number of bins, unless given, are multiples of 1, 2 or 5 times a power of ten of bins: at most a
-        twentieth of these times.
+        Start and number of bins, unless given, are multiples of a step: 1, 2 or 5 times a power of ten of bins. The
+        step is at most a twentieth of these times.
 
         Raises UserError if there are more than 1 000 000 bins, or the length is automatic and more than 10 ms.
         """

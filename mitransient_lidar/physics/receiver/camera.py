@@ -77,10 +77,10 @@ class Camera(Plan):
 
     Notes
     -----
-    Mean and variance are exact below saturation; a limit cuts a Pearson distribution of type III with the charge's
+    Mean and variance are exact below saturation. A limit cuts a Pearson distribution of type III with the charge's
     mean, variance and skewness. The higher limit, full well or converter, is left out. Blur is T. Lindeberg's discrete
     Gaussian, IEEE Trans. PAMI 12, 234 (1990), doi:10.1109/34.49051. Its MTF is exp(-t (1 - cos 2 pi f)) along each axis
-    at f cycles per pixel; images are mirrored at their edges, which keeps the sum. Intensifiers and electron
+    at f cycles per pixel. Images are mirrored at their edges, which keeps the sum. Intensifiers and electron
     bombardment multiply before the chip. An electron-multiplying CCD needs a shutter before it, and multiplies its dark
     current. Phosphor afterglow and the crosstalk and afterpulses of counters are left out.
     """

@@ -294,9 +294,10 @@ class ReceiverChain:
     ) -> FloatArray:
         """Return the samples' signal-to-noise ratio in one shot, shape (..., sample).
 
-        The mean excess over the mean without signal is divided by the standard deviation with signal: 0 without signal,
-        infinite without noise, and NaN where most samples are saturated. For the mean of n shots the ratio is sqrt(n)
-        times larger. `lit` is the result of `expected` for the other arguments, if known; arguments as for `apply`.
+        The mean excess over the mean without signal is divided by the standard deviation with signal. The result is 0
+        without signal, infinite without noise, and NaN where most samples are saturated. For the mean of n shots the
+        ratio is sqrt(n) times larger. `lit` is the result of `expected` for the other arguments, if known; arguments as
+        for `apply`.
         """
         if lit is None:
             lit = self.expected(power, bin_width_ns, background)

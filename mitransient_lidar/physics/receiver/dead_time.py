@@ -6,8 +6,8 @@ light, and less in strong light, whose first event is early. The excess over the
 of further dead bins. This is the model of Coates (1968) with a dead time shorter than the record. With this u the count
 rate in steady light is exact (W. Feller 1948, "On probability problems in the theory of counters").
 
-Arrays `events` hold the mean number of events per bin that a live cell would detect, shape (..., time), and
-probabilities have the same shape. All cells are live at the first bin.
+Arrays `events` contain the mean number of events per bin that a live cell would detect, shape (..., time).
+Probabilities have the same shape. All cells are live at the first bin.
 
 After a count a channel with afterpulses is dead as without them. Once it is live again, the time to an afterpulse is
 exponentially distributed, with a probability that an afterpulse occurs at all. The next count, of either kind, begins

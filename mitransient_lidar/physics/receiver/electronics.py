@@ -207,7 +207,7 @@ class LogAmplifier(Plan):
     """Logarithmic compression for voltages of either sign.
 
     The output is volts_per_decade asinh(v/(2 knee_v))/ln 10: volts_per_decade log10(v/knee_v) for v well above the
-    knee, and smooth at 0, where noise makes the input negative.
+    knee. It is smooth at 0, where noise makes the input negative.
     """
 
     volts_per_decade: Annotated[float, positive_option("Output increase per input decade", "V")]

@@ -71,8 +71,8 @@ class GramCharlierSeries:
 
         Third and fourth cumulants come from this part alone; the sum then has exactly this series.
 
-        `total`, `part`: slope variances upwind and crosswind for both parts together and for this part [1], positive;
-        in reverse order, the series of the sum follows from the part's.
+        `total`, `part`: slope variances upwind and crosswind for both parts together and for this part [1], positive.
+        In reverse order, the series of the sum follows from the part's.
         """
         y, x = (np.sqrt(both / one) for both, one in zip(total, part, strict=True))
         factors = x**2 * y, y**3, x**4, x**2 * y**2, y**4
@@ -179,8 +179,8 @@ def read_foam_map(path: str, size: float | None, origin: tuple[float, float] | N
 def crest_heights(sample: Callable[[FloatArray, FloatArray], FloatArray], x: FloatArray, y: FloatArray) -> FloatArray:
     """Return how far waves rise above their surroundings [m] on grid lines [m], shape (len(y), len(x)).
 
-    The surroundings are the four points at `SURROUNDINGS` along x and y, so that waves from 2 to 10 m count most, as
-    long as the patches of whitecaps are wide.
+    The surroundings are the four points at `SURROUNDINGS` along x and y. Waves from 2 to 10 m, as long as whitecap
+    patches are wide, then count most.
     """
     around = [sample(x + sign * SURROUNDINGS, y) + sample(x, y + sign * SURROUNDINGS) for sign in (-1, 1)]
     return np.asarray(sample(x, y) - 0.25 * (around[0] + around[1]))

@@ -108,8 +108,8 @@ class EnhancementTable:
 def slope_spread(off_nadir: float, refractive_index: float) -> float:
     """Return the displacement of a ray over depth and slope [1], at an angle from the vertical in air [rad].
 
-    The point at a depth moves by `turn_by_slope` across the plane of incidence, and by 1/cos^2(phi) times it, with the
-    refracted angle phi, in the plane: this is the geometric mean.
+    The point at a depth moves by `turn_by_slope` across the plane of incidence, and by 1/cos^2(phi) times it in the
+    plane, with the refracted angle phi. The result is the geometric mean.
     """
     cos_water = np.sqrt(1 - (np.sin(off_nadir) / refractive_index) ** 2)
     return float(turn_by_slope(off_nadir, refractive_index) / cos_water)
@@ -121,7 +121,7 @@ def slope_structures(
     """Return the structure functions of a sea, and of the same sea with ripples drawn anew for each way.
 
     `spectrum`: spectrum of all waves. `resolved_variance`, `ripple_variance`: slope variances of longer waves and of
-    ripples, both axes [1]: ripples are the waves above the wavenumber at which the spectrum reaches the first variance,
+    ripples, both axes [1]. Ripples are the waves above the wavenumber at which the spectrum reaches the first variance,
     scaled to the second.
     """
     from scipy.special import j0, j1

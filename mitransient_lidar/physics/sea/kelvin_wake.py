@@ -90,8 +90,8 @@ def kelvin_wake(
     `smallest_wavelength`. Shorter waves fade out, down to 0 at half that length, against aliasing. A wake's longest
     wave has the length 2 pi/k0 = 2 pi U^2/g: a ship too slow for the grid has the wake 0.
 
-    The integral is a sum over evenly spaced k sin(theta), which is exact except for the wake's periodic images, which
-    are kept off the grid. A sum of plane waves over a grid is a product of two matrices.
+    The integral is a sum over evenly spaced k sin(theta). It is exact except for the wake's periodic images, which are
+    kept off the grid. A sum of plane waves over a grid is a product of two matrices.
 
     References
     ----------

@@ -203,7 +203,7 @@ class MatchedSpectrum(CosineSpectrum):
 
     `spectrum`: elfouhaily, Pierson-Moskowitz or JONSWAP. One with less than a millionth of the given variances, as in
     the lightest winds, is made flat. `upwind`, `crosswind`: slope variances [1] along and across the direction, not
-    negative, such as Cox and Munk's. Their ratio is limited to a factor of 3 (cos^2 about the direction); beyond it, as
+    negative, such as Cox and Munk's. Their ratio is limited to a factor of 3 (cos^2 about the direction). Beyond it, as
     for Cox and Munk below 0.4 m/s, the larger one is reduced. `k_from`: waves with wavenumbers [rad/m] above this are
     scaled, positive. If the others alone have too much slope variance, or a ratio that scaling cannot correct, it is
     reduced in steps of a tenth. Below the longest wave all are scaled.

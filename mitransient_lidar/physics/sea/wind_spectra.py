@@ -130,7 +130,7 @@ class ElfouhailySpectrum(WindSpectrum):
 class SaturatedSpectrum(WindSpectrum):
     """Wavenumber form of a frequency spectrum with the tail alpha g^2 omega^-5, up to the slowest wave.
 
-    S(omega) d omega = S(k) dk with omega^2 = g k gives the tail (alpha/2) k^-3, whose slope variance grows by alpha/2
+    S(omega) d omega = S(k) dk with omega^2 = g k gives the tail (alpha/2) k^-3. Its slope variance grows by alpha/2
     with every factor e in k. These spectra do not include capillary waves; they end at `CUT_OFF`, the limit of gravity
     waves.
     """
@@ -186,8 +186,9 @@ class JonswapSpectrum(SaturatedSpectrum):
     """Gravity wave spectrum of a fetch-limited sea.
 
     `wind_speed`, `direction`: as for `ElfouhailySpectrum`, but with a wind speed above 0. `fetch`: distance from the
-    upwind shore [m]: g fetch/U^2 from 0.1, the start of the measurements, to 17 000, where the peak reaches the fully
-    developed sea's peak and the growth ends. `peak_enhancement`: gamma, 1 to 7; the mean over the measurements is 3.3.
+    upwind shore [m], such that g fetch/U^2 is 0.1 to 17 000. The measurements start at 0.1; at 17 000 the peak reaches
+    the fully developed sea's peak and the growth ends. `peak_enhancement`: gamma, 1 to 7; the mean over the
+    measurements is 3.3.
 
     Hasselmann et al. (1973), Dtsch. Hydrogr. Z. Suppl. A8 (12), with X = g fetch/U^2: alpha = 0.076 X^-0.22,
     omega_p = 22 (g/U) X^(-1/3), widths 0.07 below and 0.09 above the peak.

@@ -222,7 +222,7 @@ def petzold_water(name: str) -> PhaseFunction:
     """Phase function of one of Petzold's waters as a function of angle [rad].
 
     Returns the function from angles [rad], 0 to pi, to p [1/sr], normalised to 1; infinite at 0. Between the tabulated
-    angles ln p is linear in ln theta; below 0.1 degree the power law through the first two angles continues, with
+    angles ln p is linear in ln theta. Below 0.1 degree the power law through the first two angles continues, with
     exponents from -1.19 to -1.60.
 
     Raises UserError if the name is unknown.
@@ -237,7 +237,7 @@ def petzold_water(name: str) -> PhaseFunction:
     report extrapolates with a power law.
 
     With this interpolation the tables of ``clear``, ``coastal`` and ``turbid`` integrate to 0.0372, 0.2189 and 1.820
-    1/m; the report's own sums are 0.0373, 0.2193 and 1.824. Mean cosines are 0.871, 0.947 and 0.920, and bb/b is
+    1/m. The report's own sums are 0.0373, 0.2193 and 1.824. Mean cosines are 0.871, 0.947 and 0.920, and bb/b is
     0.0442, 0.0134 and 0.0200.
     """
     if name not in PETZOLD_WATERS:

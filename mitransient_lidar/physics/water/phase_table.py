@@ -37,7 +37,7 @@ class PowerLawTable:
     (s/s_i)^-exponent_i; below s_0, p = value_0 (s/s_0)^-cap_exponent. Density, cumulative distribution and its inverse
     are closed forms of the same function, so that samples follow the density exactly.
 
-    Forward peaks in natural water rise as a power of the angle over six decades, which uniform nodes in ln s resolve
+    Forward peaks in natural water rise as a power of the angle over six decades. Uniform nodes in ln s resolve them,
     and a table in cos(theta) does not. The default, 2048 nodes from s = 1e-12 (theta = 2 microradian), has 51 nodes in
     the backward hemisphere, which spans only ln 2. There Fournier-Forand functions are interpolated to 2e-4. Narrow
     backward peaks need more nodes. With a weak backward Henyey-Greenstein lobe the error at 180 degrees is 3e-4 for g =
@@ -131,10 +131,10 @@ class PowerLawTable:
         """Return the function with another value at 180 degrees and the same backscatter ratio.
 
         Between 90 and 180 degrees it is multiplied by A + B exp(-(1 - s)/w^2). Here 1 - s is about a quarter of the
-        squared angle from 180 degrees and 2 w is 6 degrees: at 170 degrees B counts by 6 %. Measured functions over
-        their bb agree within 5 % from 90 to 170 degrees (Sullivan and Twardowski 2009, doi:10.1364/AO.48.006811), but
-        not nearer to 180 degrees (Zhang et al. 2020, Appl. Opt. 59, C31). The ratio is kept within 0.05 % where the
-        function has no peak of its own in the last 10 degrees.
+        squared angle from 180 degrees, and 2 w is 6 degrees. At 170 degrees B counts by 6 %. Measured functions over
+        their bb agree within 5 % from 90 to 170 degrees (Sullivan and Twardowski 2009, doi:10.1364/AO.48.006811).
+        Nearer to 180 degrees they do not (Zhang et al. 2020, Appl. Opt. 59, C31). The ratio is kept within 0.05 % where
+        the function has no peak of its own in the last 10 degrees.
 
         Raises UserError if A would be negative.
 
@@ -256,9 +256,10 @@ def read_phase_table(path: str | PathLike[str]) -> PhaseOfFile:
     Raises UserError if the file cannot be read or does not hold such a table (the message names the line), or if the
     values rise towards 0 so steeply that their integral diverges.
 
-    `path`: text file with two columns, as `text_tables.read_table` reads it. The scattering angle is in degrees, or in
-    rad if its heading says so, increasing within 0 to 180 degrees, at least 10 with any spacing, the last 170 or more.
-    The value is positive, in 1/sr or any other unit per solid angle (such as a volume scattering function).
+    `path`: text file with two columns, as `text_tables.read_table` reads it. Scattering angles are in degrees, or in
+    rad if the heading states it. They increase within 0 to 180 degrees, with any spacing. At least 10 are needed, the
+    last at 170 or more. The value is positive, in 1/sr or any other unit per solid angle (such as a volume scattering
+    function).
 
     Between the angles ln p is linear in ln theta, as for `phase.petzold_average_particle`. Below the first angle the
     power law through the first two continues, or p is constant where the power law would decrease towards 0. If the

@@ -260,7 +260,7 @@ def read_profile(path: str | os.PathLike[str], wavelength_nm: float | None = Non
 
         Rows are sorted by depth, and rows at one depth are averaged. Rows with missing values are left out; in
         coefficients, -99, -999, -9999 and -99999 count as missing. The log reports all this. Other quantities that a
-        probe measures, such as temperature or time, are not used; all other columns are rejected as possible
+        probe measures, such as temperature or time, are not used. All other columns are rejected as possible
         misspellings.
     wavelength_nm : float, optional
         Which wavelength [nm] to read from a file with several. Columns without wavelength belong to all.

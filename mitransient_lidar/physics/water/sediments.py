@@ -63,7 +63,7 @@ class HapkeSurface(Checked):
         return (1 - gamma) / (1 + gamma)
 
     def single_scattering(self, half_sine_squared: ArrayLike) -> FloatArray:
-        """Return [1 + B(g)] p(g) at phase angles given by sin^2(g/2), 0 to 1; p has the mean 1 over the sphere."""
+        """Return [1 + B(g)] p(g) at phase angles given by sin^2(g/2), 0 to 1. The mean of p over the sphere is 1."""
         s = np.asarray(half_sine_squared, dtype=np.float64)
         b = self.lobe_asymmetry
         with np.errstate(divide="ignore"):

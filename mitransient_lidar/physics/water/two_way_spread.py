@@ -34,8 +34,8 @@ class TwoWaySpread:
     """Paths that scatter forwards on at least one of their ways, by depth; arrays of shape (depths, paths).
 
     All are relative to the straight path along the axis, which is tilted towards +x, and sorted by displacement. The
-    mean of a weight is the energy of scattered light over (1 - q^2) times that of light that meets absorption alone,
-    where q is the share of light that no event has turned on one way.
+    mean of a weight is the energy of scattered light over (1 - q^2) times the energy of light that meets absorption
+    alone. Here q is the share of light that no event has turned on one way.
     """
 
     depths: FloatArray  #: Depths [m], increasing, shape (depths,).

@@ -107,10 +107,10 @@ class InherentProperties:
 
         The mean down to the depth of a tenth of the irradiance just below the surface: Kd^2 = a^2 + 4.10 a^0.934
         bb_p^0.849 b_p^0.217 + 1.6 a b_w. The particles p have Fournier-Forand functions, and w are molecules. It fits a
-        Monte Carlo (``oracles/diffuse_attenuation.py`` in the tests) with an error of 0.2 % rms and 0.6 % at most for
-        b/a from 0.5 to 16 and bb_p/b_p from 0.003 to 0.05. The formula by Lee, Du and Arnone (2005), J. Geophys. Res.
-        110, C02016, doi:10.1029/2004JC002275, gives 0 to 2 % more in Jerlov's types I to 3C, and 4 to 7 % more in 5C to
-        9C.
+        Monte Carlo (``oracles/diffuse_attenuation.py`` in the tests) with an error of 0.2 % rms and 0.6 % at most. This
+        holds for b/a from 0.5 to 16 and bb_p/b_p from 0.003 to 0.05. The formula by Lee, Du and Arnone (2005), J.
+        Geophys. Res. 110, C02016, doi:10.1029/2004JC002275, gives 0 to 2 % more in Jerlov's types I to 3C, and 4 to 7 %
+        more in 5C to 9C.
         """
         return _diffuse_attenuation(self.absorption, self.scattering, self.backscattering, self.water_scattering)
 
@@ -141,9 +141,9 @@ def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
     the open ocean, with a scatter of 0.002. At the coast it is 0.0183, as for Petzold's average particle. Absorption
     then follows from Kd (`InherentProperties.kd`). Types I and IA are `chlorophyll` with the same Kd.
 
-    Uncertainties are 20 to 30 % for b, 30 % for bb in the ocean and 50 % at the coast, and 3 to 15 % for a. Williamson
-    and Hollins give less absorption in all types but IB: by 13 % (II), 22 % (III), 3 % (1C), 16 % (3C) and 26 % (5C).
-    With it, Jerlov's Kd would need particles with bb/b 0.028, 0.041, 0.021, 0.035 and 0.043.
+    Uncertainties are 20 to 30 % for b and 3 to 15 % for a. For bb they are 30 % in the ocean and 50 % at the coast.
+    Williamson and Hollins give less absorption in all types but IB: by 13 % (II), 22 % (III), 3 % (1C), 16 % (3C) and
+    26 % (5C). With it, Jerlov's Kd would need particles with bb/b 0.028, 0.041, 0.021, 0.035 and 0.043.
     """
     if water_type not in _JERLOV:
         raise UserError(f"water_type = {water_type!r} must be one of {', '.join(_JERLOV)}")

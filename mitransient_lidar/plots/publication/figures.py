@@ -74,7 +74,7 @@ def figures(
     *,
     target_error: Annotated[float, Option("Relative standard error of the median bin", 0, 1, above=True)] = 0.01,
     max_time: Annotated[float | None, positive_option("Begin no figure after this many seconds")] = None,
-    seed: Annotated[int, Option("Random seed", 0, 10**6)] = 0,
+    seed: Annotated[int, Option("Random seed", 0, 2**31)] = 0,
     progress: ProgressCallback | None = None,
 ) -> Publication:
     """Make the figures for FOI's multipixel lidar model (Tulldahl 2006), and the table with its statements.

@@ -105,9 +105,9 @@ def render_frames(
     xarray.Dataset
         A gate stack with the dimension ``frame`` first, also for one frame: ``gate_energy`` and ``gate_energy_stderr``
         [J] over (frame, row, column, gate) or (frame, pixel, gate). ``pulse_time`` [s] over (frame, gate) is an image's
-        first pulse time after the first pulse of all, which meets the sea at the scene's time. With a `speed`,
-        ``platform_x`` and ``platform_y`` [m] are the displacement at that time. Gates start at fixed times after each
-        pulse. After Ctrl-C the completed frames are returned, and the attribute ``interrupted`` is 1.
+        first pulse time after the very first pulse. The very first pulse meets the sea at the scene's time. With a
+        `speed`, ``platform_x`` and ``platform_y`` [m] are the displacement at that time. Gates start at fixed times
+        after each pulse. After Ctrl-C the completed frames are returned, and the attribute ``interrupted`` is 1.
 
     Raises
     ------

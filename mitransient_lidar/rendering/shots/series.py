@@ -131,15 +131,15 @@ def render_shots(
         Longest time for the passes of all shots [s], greater than 0. It is shared among the batches, which end with
         fewer passes, at least two. Where these take longer, too, the result holds the batches begun by then.
     pass_share
-        Share of a full pass's paths in each pass, 1/512 to 1; by default 1, and with a `target_error` one that needs
-        few passes. The automatic cells in passes with few paths are up to twice as wide, which changes the water's
-        signal by about 0.3 %.
+        Share of a full pass's paths in each pass, 1/512 to 1. It is 1 by default, and with a `target_error` one that
+        needs few passes. The automatic cells in passes with few paths are up to twice as wide, which changes the
+        water's signal by about 0.3 %.
     light
         'merging', the integrator of the scene, or 'maps': the beam's light is looked up in maps at several depths
         (`transport.light_maps.renderer`). Maps serve waves, layers of one index and a bottom, without derivatives. 2
         passes are usual. Mean energies agree with merging to within 1 %, bottom times to within 0.05 ns.
     first_seed
-        Seed of the first shot, 0 to 2^40; shot n is rendered with this seed plus n.
+        Seed of the first shot, 0 to 2^53; shot n is rendered with this seed plus n.
     axis
         Time bins instead of automatic ones, which contain all shots' light. They must contain it, too, up to a
         twentieth of the record.
@@ -161,8 +161,8 @@ def render_shots(
         face towards the lidar), ``true_slope_across`` (positive for a rise to the left) [1] and ``true_surface_height``
         [m] above the mean sea level; ``true_bottom_depth`` [m] below the mean sea level where the axis, refracted at a
         level sea, meets the bottom (`WaterScene.bottoms`), NaN where it misses; ``true_bottom_depth_below_surface`` [m]
-        below the mean surface in the footprint, as echo depths are, the sum of depth and surface height; for the water,
-        whichever way it is given, ``true_absorption`` a, ``true_scattering`` b, ``true_backscattering`` bb,
+        below the mean surface in the footprint, as echo depths are, the sum of depth and surface height. For the water,
+        whichever way it is given: ``true_absorption`` a, ``true_scattering`` b, ``true_backscattering`` bb,
         ``true_attenuation`` c and ``true_kd`` [1/m], means over depth from the mean sea level to that bottom, without
         bubbles (`truth.water_means`). Attributes such as ``surface_time_ns`` and the limits of the echo window belong
         to the first shot; positions are left out. ``series_parameters``: JSON of the scene parameters that shots
@@ -192,7 +192,7 @@ def render_shots(
         usual = 2 if wanted is None else MOST_PASSES_FOR_ERROR, 1.0
     passes = usual[0] if passes is None else passes
     share = options.pass_share or usual[1]
-    first_seed = integer("first_seed", first_seed, 0, 2**40)
+    first_seed = integer("first_seed", first_seed, 0, 2**53)
     given = None if positions is None else _checked_places(positions)
     variants.leave_the_gpu("shots are rendered")
     source: dict[str, Any] = {"instrument": instrument, "sensor": sensor}

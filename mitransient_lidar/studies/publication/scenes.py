@@ -53,7 +53,7 @@ class Renders:
 
     #: Relative standard error of a figure's median bin, greater than 0. The mast in figure 4 may miss it.
     target_error: float = 0.01
-    seed: int = 0  #: Seed of all random numbers, 0 to 10^6.
+    seed: int = 0  #: Seed of all random numbers, 0 to 2^31.
     progress: ProgressCallback | None = None  #: Called with a `passes.Progress` after every batch of shots.
     _results: dict[tuple[Any, ...], xr.Dataset] = field(default_factory=dict)
     _sessions: dict[tuple[str, int], LoadedScene] = field(default_factory=dict)
@@ -61,7 +61,7 @@ class Renders:
 
     def __post_init__(self) -> None:
         self.target_error = relative_error("target_error", self.target_error)
-        self.seed = integer("seed", self.seed, 0, 10**6)
+        self.seed = integer("seed", self.seed, 0, 2**31)
 
     def shot(self, scene: str, **params: float) -> xr.Dataset:
         """Return `REPEATS` independent renders of a scene's shot, with the light by its origin if there is a target."""

@@ -155,7 +155,7 @@ class ReceivedDaylight:
 
 
 class DaylightLight(PathLight):
-    """Sun and sky, and the light of a pass; uniform random numbers `u` choose a point on the sun's disc per path."""
+    """Sun and sky, and the light of a pass. Uniform random numbers `u` choose a point on the sun's disc per path."""
 
     def __init__(self, scene: DaylightScene, received: ReceivedDaylight, u: mi.Point2f, weight: mi.Float) -> None:
         self.scene, self.received, self.weight = scene, received, weight

@@ -72,8 +72,8 @@ def unsuited(scene: LidarScene) -> str | None:
 def over_water(scene: LidarScene, places: FloatArray, turns: FloatArray | None) -> BoolArray:
     """Return which shots have solids below the sea alone in their beam, shape (shots,); arguments as `light_faintly`.
 
-    Beam rays, the outermost among them, pass the sea without meeting a solid: down to 0.05 m or, where waves do not
-    follow the bottom, to the lowest trough.
+    Beam rays, the outermost among them, pass the sea without meeting a solid. This holds down to 0.05 m or, where waves
+    do not follow the bottom, to the lowest trough.
     """
     wet = np.ones(len(places), dtype=bool)
     if not scene.has_dry_solids:
@@ -101,8 +101,8 @@ def over_water(scene: LidarScene, places: FloatArray, turns: FloatArray | None) 
 def light_faintly(scene: LidarScene, target: mi.Shape, places: FloatArray, turns: FloatArray | None) -> BoolArray:
     """Return which shots light a target so faintly that its shadow needs no merging, shape (shots,).
 
-    In each pixel at most the share `_SHADOWED` of the beam over a level sea meets the target's box, widened as waves
-    deflect the light.
+    In each pixel at most the share `_SHADOWED` of the beam over a level sea meets the target's box. The box is widened
+    as waves deflect the light.
 
     `scene`, `target`: the lidar's scene, and a target of it. `places`: points (x, y) of the shots among the shapes [m],
     shape (shots, 2). `turns`: cosine and sine of their rotations about the vertical, shape (shots, 2); None without

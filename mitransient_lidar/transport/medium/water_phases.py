@@ -36,7 +36,7 @@ _SMALLEST_SHARE = 1e-4  #: Share of the scattering below which pure water is lef
 class ScattererPhases:
     """Phase functions by the number of the scatterer: layers from the top, then bubbles.
 
-    Functions that are tables with the same nodes are looked up in one large table; others are called through pointers,
+    Functions that are tables with the same nodes are looked up in one large table. Others are called through pointers,
     which is slower. Scatterers may share a function object.
     """
 

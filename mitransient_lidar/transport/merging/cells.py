@@ -260,8 +260,8 @@ class WaterCells:
         """Return the cells that contain points.
 
         Points of unscattered light move to their layer's plane along their lines in a `direction`, all others along the
-        beam as it is refracted there. The volume for unscattered light is corrected by the beam profile on the plane
-        divided by the profile at the point: it represents light at the point.
+        beam as it is refracted there. The volume for unscattered light represents light at the point. It is corrected
+        by the beam profile on the plane divided by the profile at the point.
         """
         rings = self.rings
         depth, slope, stretch = self._depth_along_beam(point)

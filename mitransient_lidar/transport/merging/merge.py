@@ -1,7 +1,7 @@
 """Merging laser light with receiver paths, in water cells and on solids' patches, and their connection.
 
 Scattered light that reaches a narrow beam from far outside it rarely meets one of its cells. A connection estimates the
-same path from two points that lie far apart, joined by a straight segment in the water (vertex connection and merging:
+same path from two points that lie far apart. A straight segment in the water joins them (vertex connection and merging:
 Georgiev et al. 2012, doi:10.1145/2366145.2366211). The balance heuristic weights each connection with all other
 connections and merges that make its path.
 """
@@ -42,7 +42,7 @@ def merge_in_water(
 
     A point represents a track with length s and throughput beta, a photon one with length s' and energy w. With the
     cell's volume V each pair adds beta s w s' / V times scattering coefficient and phase function. The weight is among
-    all merges and `connections`, a share of all pairs, that make the same path; water and bubbles make different paths.
+    all merges and `connections`, a share of all pairs, that make the same path. Water and bubbles make different paths.
     """
     water, perturbations = scene.required_water, scene.perturbations
     cell = cells.locate(points.point)

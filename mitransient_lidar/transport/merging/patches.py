@@ -69,8 +69,8 @@ class SolidPatch:
 def foreshortening(light: mi.Float, projection: mi.Float) -> mi.Float:
     """Return a surface's area across light over its area across its patch's projection, from both cosines.
 
-    At least 0.02: light is stored divided by this number at its own point, and merged times the number at another point
-    in the patch. The light on curved surfaces is then right.
+    The result is at least 0.02. Light is stored divided by this number at its own point, and merged times the number at
+    another point in the patch. The light on curved surfaces is then right.
     """
     return dr.maximum(light / projection, _LEAST_FORESHORTENING)
 
@@ -106,7 +106,7 @@ def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) 
 class SolidPatches:
     """Patches in projection along the beam, or along x or y where steep.
 
-    In projection along the refracted beam, patches are sectors of rings about it, whatever their depth; along x or y
+    In projection along the refracted beam, patches are sectors of rings about it, whatever their depth. Along x or y
     they are squares. Light from one direction is even over areas across that direction, however curved the surface is
     (`foreshortening`).
     """

@@ -100,7 +100,7 @@ class RefractedLaserSampler(RefractedEmitterSampler):
 
         Newton's method on Snell's law for the horizontal distance between the point and the ray's crossing of z = 0. It
         starts below the root, at the refracted straight line. There the sine of the angle in water is concave in the
-        distance: the steps approach the root from one side at any altitude and angle.
+        distance. Steps approach the root from one side at any altitude and angle.
         """
         depth = dr.maximum(-point.z, _SMALLEST_DEPTH)
         height = self.laser.z

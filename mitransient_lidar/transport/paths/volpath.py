@@ -187,7 +187,7 @@ class PathTracer:
     """Traces paths from the receiver and connects their vertices to a light.
 
     Each vertex under water samples a direction in which the emitter may appear through the surface. The direction is
-    traced to the real surface, where it is connected; a path that reaches the surface unscattered is connected there,
+    traced to the real surface, where it is connected. A path that reaches the surface unscattered is connected there,
     too. Both estimate the same paths; the balance heuristic combines them (Veach and Guibas 1995,
     doi:10.1145/218380.218498).
     """

@@ -29,7 +29,7 @@ def coefficient_derivative(water: Water, name: str, layer: int, focusing: Ripple
 
     With lengths L and n scattering events in the layer, a contribution's logarithmic derivative is -L by c. By b it is
     n / b, as absorption falls where scattering grows, and by bb it is 0. To the latter two every scattering event adds
-    the phase function's logarithmic derivative, which follows from b and bb; so does the derivative of the ripple
+    the phase function's logarithmic derivative, which follows from b and bb. So does the derivative of the ripple
     factors.
 
     Raises UserError if the light does not depend on the coefficient, or the derivative at its value cannot be

@@ -284,7 +284,7 @@ class MappedPixels(PixelArray):
     All cells with one label are one pixel, named ``label`` and the number; those with the label 0 receive nothing.
     Points are drawn over all labelled cells, so that the pixels sum to the single pixel of the same cells path by path.
 
-    `labels`: integers from 0, not all 0, shape (rows, columns); row 0 is the far edge (+angle_x), column 0 the left one
+    `labels`: integers from 0, not all 0, shape (rows, columns). Row 0 is the far edge (+angle_x), column 0 the left one
     (+angle_y). `field_of_view`: side of the square [rad], positive.
     """
 

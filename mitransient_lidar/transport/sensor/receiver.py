@@ -53,7 +53,7 @@ class Receiver:
     """The attribute ``receiver`` of a sensor plugin.
 
     Pixels are regions on the detector. Light from the direction g falls on g + delta, with delta drawn from the
-    point-spread function `blur`; sharp optics (None) have delta = 0.
+    point-spread function `blur`. Sharp optics (None) have delta = 0.
     """
 
     pose: KernelPose
@@ -114,7 +114,7 @@ class SensorSampler:
     Around the footprint, directions are distributed in `Octaves`, as scattering spreads the light of a narrow beam.
     Both parts are weighted by the balance heuristic. Samples are stratified, and neighbours have similar directions.
 
-    With blur, directions over the view draw the detector point p and the direction p - delta; others draw the direction
+    With blur, directions over the view draw the detector point p and the direction p - delta. Others draw the direction
     g and the point g + delta. Both draw delta from the point-spread function, whose density cancels.
     """
 

@@ -118,6 +118,8 @@ OPTIONS = [
     (RENDER, "-D", "altitud=3", "did you mean altitude"),
     (RENDER, "--output", "\udcff", "not valid UTF-8"),
     (RENDER, "--passs", "3", "No such option"),
+    (("scenes", "instruments", "--json"), "--xml", "riegl_vq840g", "--xml and --json are alternatives"),
+    (("compare", "a.nc", "b.nc", "--json"), "--output", "a.png", "--json draws nothing"),
     (("find-shots", "table1"), "--slope-sigmas", "20", "the sea has no place of the kind towards"),
     (("find-shots", "table1"), "--at", "3", "must be two numbers"),
     (("find-shots", "table1"), "--output", "a.txt", "must end in .png"),

@@ -1,5 +1,6 @@
 """Every command once, with files, on a scene of few paths; scenes, options and results have tests of their own."""
 
+import json
 import re
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from command_line import COMMANDS, assert_refused, run
 
+import mitransient_lidar
 from mitransient_lidar.loading import catalogue
 
 #: The reference compiles one kernel, merging three.
@@ -145,6 +147,19 @@ def test_derivatives_and_a_fit(scene, tmp_path):
 def test_comparison_of_a_result_with_itself(result):
     done = run("compare", result, result)
     assert done.exit_code == 0, done.stderr
+    found = json.loads(run("compare", result, result, "--json").stdout)
+    assert found["agrees"]
+    assert found["energy_ratio"] == 1
+    assert f"{found['bin_count']} bins" in done.stdout
+    assert json.loads(run("info", result, "--json").stdout)["passes"] == mitransient_lidar.open(result).attrs["passes"]
+
+
+def test_facts_for_programs():
+    facts = json.loads(run("scenes", "instruments", "riegl_vq840g", "--json").stdout)
+    assert facts["parameters"]["wavelength_nm"]["value"] == "532"
+    assert facts["channels"]
+    assert facts["title"] == json.loads(run("scenes", "instruments", "--json").stdout)["riegl_vq840g"]
+    assert json.loads(run("info", "--json").stdout)["mitransient-lidar"] == mitransient_lidar.__version__
 
 
 @pytest.mark.parametrize("command", commands(OTHER_COMMANDS))
