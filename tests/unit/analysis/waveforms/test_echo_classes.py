@@ -144,6 +144,23 @@ def test_faint_bottoms_without_a_surface_are_found():
     assert (np.abs(depth - 0.5) < 3 * error).all()
 
 
+def test_faint_first_echoes_at_the_surface_level_are_the_likeliest_class():
+    """Below 8 standard errors they were surfaces, with stated probabilities down to 1e-22; land was lost."""
+    heights, depths = np.array([0.3, 1.0]), np.array([0.2, 0.2, 0.3, 0.3])
+    powers = [land(one) for one in heights]
+    powers += [water(d, backscattering=1e-3, level=h) for d, h in zip(depths, (0.0, 0.1) * 2, strict=True)]
+    record = recorded(powers, 6)
+    mean = record["signal_mean"].values.reshape(len(powers), -1)
+    mean -= np.median(mean[:, :40])
+    # The errors of a render with few passes.
+    noise = np.hypot(0.14 * mean, 2e-3 * mean.max(axis=1, keepdims=True))
+    each = [found(record.isel(shot=[row]), noise=noise[row]) for row in range(len(powers))]
+    classes, depth, error = (np.concatenate(one, axis=-1) for one in zip(*each, strict=True))
+    assert (classes[0] == EchoClass.NONE).all()
+    assert classes[1].tolist() == [EchoClass.LAND] * 2 + [EchoClass.MERGED] * 4
+    assert (np.abs(depth - [*-heights, *depths]) < 3 * error).all()
+
+
 def test_turbid_water_seen_by_long_pulses_has_no_bottom():
     """A blurred bottom below a column of a free decay fits such columns as well, with more parameters."""
     kinds = [(k, b, glint) for k, b in ((0.5, 0.03), (0.75, 0.1)) for glint in (0.0, 0.02)]
