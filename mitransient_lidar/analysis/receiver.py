@@ -33,6 +33,7 @@ from mitransient_lidar.physics.receiver.receiver_files import camera as camera_o
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 from mitransient_lidar.results.attributes import join, label, made_from, split
 from mitransient_lidar.results.geometry import optional_number
+from mitransient_lidar.results.sum_errors import pooled_errors
 
 #: A power, or pixel powers.
 Powers = Union[npt.ArrayLike, "xr.DataArray"]
@@ -355,7 +356,7 @@ def _record_channel(
     values["receiver_response"] = (("lag",), weights)
     if "waveform_stderr" in dataset:
         # The errors of a render's neighbouring bins agree in sign, as its pulse smooths them.
-        error = np.nan_to_num(dataset["waveform_stderr"].transpose(*dims).values)
+        error = np.nan_to_num(pooled_errors(dataset, few=True).transpose(*dims).values)
         shifted = receiver.expected(power + 10**-density * error, width, background).mean - expected.mean
         shifted = np.repeat(np.abs(shifted), number, axis=0) if series else np.abs(shifted)
         values["signal_mean_stderr"] = (dims, shifted)

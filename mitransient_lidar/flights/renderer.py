@@ -40,7 +40,6 @@ from mitransient_lidar.flights.preparation import (
 from mitransient_lidar.flights.recording import (
     SETTINGS,
     chosen_settings,
-    pooled_errors,
     record,
     saturated_pulses,
 )
@@ -52,6 +51,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.results.attributes import described, join
 from mitransient_lidar.results.geometry import LinesOfSight
+from mitransient_lidar.results.sum_errors import pooled_errors
 
 if TYPE_CHECKING:
     from mitransient_lidar.rendering.shots.batches import ShotBatches
@@ -178,9 +178,7 @@ class FlightRenderer(Renderer):
     def _stacked(self, inputs: Mapping[str, Column], *, turned: bool = True) -> tuple[dict[str, Array], xr.Dataset]:
         """Return the arrays of pulses, stacked, and their echoes, whose pixels may be turned about the axis."""
         series, later, _ = self._render(inputs, self._passes(until_error=True))
-        series["waveform_stderr"] = pooled_errors(
-            series["waveform"], series["waveform_stderr"], series["shot_passes"].values
-        )
+        series["waveform_stderr"] = pooled_errors(series, few=False)
         recorded = record(series, self.plan, inputs)
         measured = self._with_turned_pixels(recorded, inputs) if turned else recorded
         infrared = self._infrared_record(inputs, later) if self.plan.infrared else None
@@ -222,9 +220,7 @@ class FlightRenderer(Renderer):
         own = {name.removeprefix("infrared_"): column for name, column in own.items()}
         renderer = _infrared(self, int(bins[0]))
         series, own_later, _ = renderer._render({**own, "record_start_ns": start}, self._passes(until_error=True))
-        series["waveform_stderr"] = pooled_errors(
-            series["waveform"], series["waveform_stderr"], series["shot_passes"].values
-        )
+        series["waveform_stderr"] = pooled_errors(series, few=False)
         recorded = record(series, renderer.plan, own)
         apart = xr.DataArray(later - own_later, dims="shot")
         return recorded.assign_coords(surface_time=recorded["surface_time"] + apart)

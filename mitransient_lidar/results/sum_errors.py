@@ -21,6 +21,9 @@ _SUMS, _FAINT = 256, 1e-6  #: Most sums of a length, and smallest sum over the l
 #: Passes below which correlations are hardly known, smallest ratio of means, and samples in memory at a time for them.
 _FEW_PASSES, _LEAST_RATIO, _TOGETHER = 8, 0.1, 2**18
 
+#: Fewest passes whose own errors are known, bins whose variances are pooled, and bins of a mean power.
+_KNOWN_PASSES, _POOLED_BINS, _MEAN_BINS = 4, 21, 5
+
 _CURVE = ("error_inflation_bins", "error_inflation")
 
 
@@ -177,6 +180,56 @@ def with_correlation(dataset: xr.Dataset, middles_ns: FloatArray, correlation: F
     mean, stderr = (dataset[name].values.reshape(-1, count) for name in ("waveform", "waveform_stderr"))
     bins, inflation = known.median_curve(mean, stderr)
     return dataset.assign_attrs(dict(zip(_CURVE, (bins, inflation), strict=True)))
+
+
+def pooled_errors(dataset: xr.Dataset, *, few: bool) -> xr.DataArray:
+    """Return a result's ``waveform_stderr``, in some shots from neighbouring bins.
+
+    A standard error from a few passes is itself uncertain, and too small where no rare bright path came. Such render
+    noise would count as an echo. A sum of equally weighted paths has a variance in proportion to its mean. So a bin's
+    pooled variance is its power times the variance-to-power ratio over 21 bins. Relative errors rise behind an echo:
+    pooled, they would raise that of its peak.
+
+    The error of two passes is hardly known, and twice too large at one bottom in twenty, which would be lost in it.
+    With fewer than four passes, all such shots together give the relative error over the 21 bins, larger beside their
+    echo. A bin's own error then does not count. Of CZMIL in turbid water (`teledyne_czmil`, 5C and 7C, 7 to 16 m, wind
+    6 m/s, 24 shots of two passes), own errors make 32 false bottoms, pooled ones two.
+
+    With more passes, errors are at least the bin's own. 64 pulses each in ``semi_arc`` and ``palmer``, 8 and 11 passes,
+    were compared with renders to 2 %. The rms ratio of error to pooled error is 1.26 and 0.98; with pooled relative
+    errors it would be 1.69 and 1.26.
+
+    Parameters
+    ----------
+    dataset
+        With ``waveform`` and its errors, over time and optionally shot, and the coordinate ``shot_passes`` or the
+        attribute ``passes``. Without both, errors stay as they are.
+    few
+        Whether shots with fewer than four passes have pooled errors, or the others.
+    """
+    from scipy.ndimage import uniform_filter1d
+
+    stderr = dataset["waveform_stderr"]
+    passes = dataset.coords.get("shot_passes", dataset.attrs.get("passes", np.nan))
+    chosen = np.asarray(passes < _KNOWN_PASSES if few else passes >= _KNOWN_PASSES)
+    if not chosen.any():
+        return stderr
+    first = ["shot"] if "shot" in stderr.dims else []
+    power, error = (dataset[name].transpose(*first, ..., "time") for name in ("waveform", "waveform_stderr"))
+    own = error.values if first else error.values[np.newaxis]
+    # A mean over bins, since one that is low by chance is so in both.
+    level = uniform_filter1d(np.abs(power.values).reshape(own.shape), _MEAN_BINS, axis=-1, mode="nearest")
+    of_all, variance = (uniform_filter1d(one, _POOLED_BINS, axis=-1, mode="nearest") for one in (level, own**2))
+    chosen = np.broadcast_to(chosen, len(own))
+    if few:
+        known = np.sum(uniform_filter1d(level[chosen] ** 2, _POOLED_BINS, axis=-1, mode="nearest"), axis=0)
+        relative = np.divide(np.sum(variance[chosen], axis=0), known, out=np.zeros_like(known), where=known > 0)
+        variance = np.maximum(level, of_all) * of_all * relative
+    ratio = np.divide(variance, of_all, out=np.zeros_like(own), where=of_all > 0)
+    # Running sums leave rounding errors below 0.
+    pooled = np.sqrt(np.maximum(level * ratio, 0))
+    own = np.where(chosen[(..., *[np.newaxis] * (own.ndim - 1))], pooled if few else np.maximum(own, pooled), own)
+    return error.copy(data=own.reshape(error.shape))
 
 
 def _check(dataset: xr.Dataset) -> None:

@@ -20,6 +20,8 @@ from mitransient_lidar.core.validation import FloatArray, integer, non_negative
 _FEWEST = 8  # bins of a column's fit
 _SEGMENT = 4  # fewest bins on either side of a change
 _CLEAR = 6.0  # smallest signal-to-noise ratio of a bin whose logarithm is used
+_OF_TAILS = 0.3  # error of the tails of echoes between which a column is short
+_STEEPEST = 5.0  # decay of a short column over the typical one
 _RUN = 7  # bins of the running mean from which a logarithm is weighted
 
 
@@ -126,6 +128,31 @@ def column_echoes(records: Records, column: ColumnFit, start: FloatArray, end: F
         half * column.decay_stderr / decay,
         np.where(known, 0, int(EchoFlag.NO_ECHO)),
     ).known_only(known)
+
+
+def column_between(
+    records: Records, echoes: list[Echoes], width_ns: float, surface_ns: FloatArray, decay: float
+) -> FloatArray:
+    """Return the signals of columns too short for a fit at the surface, shape (n,); NaN without samples.
+
+    They are means over the samples between the surface and the last echo, less the tails of all echoes, which are not
+    wider than expected. A sample counts by its noise and 0.3 of the tails. The decay is that of the samples, one to
+    five times a typical one [1/ns].
+    """
+    time = records.time_ns[np.newaxis]
+    inside = (time > surface_ns[:, np.newaxis]) & (time < echoes[-1].time_ns[:, np.newaxis])
+    tails = np.zeros(records.power.shape)
+    for one in echoes:
+        apart = (time - one.time_ns[:, np.newaxis]) / np.minimum(one.width_ns, width_ns)[:, np.newaxis]
+        tails += np.nan_to_num(one.amplitude[:, np.newaxis] * np.exp(-4 * np.log(2) * apart**2))
+    weight = np.where(inside, 1 / (records.noise**2 + (_OF_TAILS * tails) ** 2), 0)
+    total = np.maximum(weight.sum(axis=1), 1e-300)
+    weight /= total[:, np.newaxis]
+    rest, delay = records.power - tails, np.where(inside, time - surface_ns[:, np.newaxis], 0)
+    mean, centre = np.sum(weight * rest, axis=1), np.sum(weight * delay, axis=1)
+    apart = delay - centre[:, np.newaxis]
+    falls = -np.sum(weight * rest * apart, axis=1) / np.maximum(mean * np.sum(weight * apart**2, axis=1), 1e-300)
+    return np.where(inside.any(axis=1), mean * np.exp(np.clip(falls, decay, _STEEPEST * decay) * centre), np.nan)
 
 
 def _normal(

@@ -15,13 +15,13 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import LidarGeometry, snell, turn_by_slope
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 from mitransient_lidar.physics.water.phase import petzold_average_particle
+from mitransient_lidar.physics.water.seawater import water_scattering
 from mitransient_lidar.physics.water.water_types import PETZOLD_BACKSCATTER_RATIO
 from mitransient_lidar.results.geometry import Attributes, LinesOfSight, lidar_system, optional_number
 
 # Constants from 40 random level seas (1 to 10 mrad, 100 to 400 m, 0 to 30 degrees off nadir, absorption 0.04 to 0.25,
 # scattering 0.02 to 0.6 1/m, 3 to 15 m deep), and of waves from shots at 4, 6 and 9 m/s.
 _LEAST = 0.0005  # relative to the depth
-_OF_RIPPLES = 0.032  # of an echo through ripples, relative to the depth, times their slope variance
 # Share of a pixel's echo that arrives with those of the other pixels. A centroid in gates includes more of its tail.
 _OF_NEIGHBOURS, _OF_GATED_NEIGHBOURS = 0.12, 0.2
 _FARTHEST_NEIGHBOUR = 1.5  # largest deviation of arrivals that counts, in pulses
@@ -33,6 +33,8 @@ _SMALLEST_SHARE = 1e-9  # of the beam in a pixel that results store
 _TYPICAL_ATTENUATION = 0.14  # of a column that is too short for a fit [1/m]
 _TYPICAL_BACKSCATTERING = 0.05  # relative to the attenuation of the column
 _ANGLES, _DISTANCES = (1e-3, 1.5, 160), 128  # scattering angles [rad], and distances to the bottom, of the delay
+_OF_VIEW = 0.32  # standard deviation of a Gaussian whose integral times r^2 is a disk's, relative to its diameter
+_BY_MOLECULES = 0.5 * float(water_scattering(532.0))  # backscattering of sea water without particles [1/m]
 TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
 # Slope of waves averaged over a beam of 2 m, relative to the standard deviation of all slopes; its power of the width.
 _MEAN_SLOPE, _OF_WIDTH, _WIDTH = 0.4, -0.25, 2.0
@@ -99,6 +101,7 @@ class DepthErrors:
         attenuation: FloatArray,
         level: FloatArray,
         *,
+        width_ns: npt.ArrayLike = 0.0,
         from_mean: bool,
         gated: bool = False,
     ) -> FloatArray:
@@ -110,6 +113,8 @@ class DepthErrors:
             Arrival times [ns] and depths [m] of the echoes.
         attenuation, level : ndarray, shape (n,)
             Attenuation K of the columns along the path [1/m], and their power at the surface [W]; NaN if unknown.
+        width_ns : array_like, shape (n, ...)
+            Full widths of the echoes at half maximum [ns]; NaN or 0 if unknown.
         from_mean : bool
             Whether depths are from the mean sea level.
         gated : bool
@@ -121,7 +126,13 @@ class DepthErrors:
 
         - the delay of scattered light; see `delays`. The backscattering bb follows from the column level, and is 0.05 K
           where no level is known;
-        - the longer paths through ripples, 0.032 times the variance of the slopes, relative to the depth;
+        - undercutting: light that was scattered sideways and meets an extended echo early has been attenuated less, by
+          exp(-2 K x) for a path shorter by x each way. An echo of the standard deviation q in depth, without that of
+          pulse and pixel, is early by 2 K q^2/cos(theta_w). Where K is unknown, it is bb/0.05;
+        - the render's bins, where neither pixel nor delay spreads the light over several; see `rounding_ns`;
+        - the longer paths through ripples, v d for the depth d. Slopes turn rays by 1 - 1/n times themselves, and v is
+          the variance of these angles in one direction. A narrow view sees light that ripples turn alike on both ways,
+          with (q + s^2)/(2 q + s^2) of v, for displacements of the variance q = v d^2, and s^2 as in `delays`;
         - light scattered from other pixels: 0.12 of the arrival's deviation from the beam-weighted mean over pixels, or
           0.2 in gates;
         - the skew of echoes that are longer than the pulse because the pixel is extended;
@@ -142,12 +153,21 @@ class DepthErrors:
             by_height = self.height * (1 - np.cos(water) / (self.group_index * cos_air))
             constant = np.hypot(constant, by_height)
         shape = (-1, *(1,) * (depth.ndim - 1))
-        delay = self.delays(depth, self.backscattering(attenuation, level).reshape(shape))
-        later = delay + _OF_RIPPLES * self.slope_variance * depth
+        scattered = self.backscattering(attenuation, level)
+        delay = self.delays(depth, scattered.reshape(shape))
+        fades = np.where(np.isfinite(attenuation), np.maximum(attenuation, 0), scattered / _TYPICAL_BACKSCATTERING)
+        wide = (np.nan_to_num(width_ns) / FWHM_PER_SIGMA) ** 2 - (resolved**2).reshape(shape)
+        per_ns = lines.depth_per_ns.reshape(shape)
+        early = 2 * per_ns**2 * np.maximum(wide, 0) * (fades / np.cos(water)).reshape(shape)
+        rounding = per_ns * rounding_ns(np.hypot(lines.surface_spread.reshape(shape), delay / per_ns), self.bin_ns)
+        of_ripples = 0.5 * self.slope_variance * float(turn_by_slope(0, self.refractive_index)) ** 2
+        apart, seen = of_ripples * depth**2, self._seen**2
+        both = np.divide(apart + seen, 2 * apart + seen, out=np.ones(depth.shape), where=apart > 0)
+        later = delay + of_ripples * depth * both
         relative = np.hypot(_LEAST, turned).reshape(shape) * depth
         share = _OF_GATED_NEIGHBOURS if gated else _OF_NEIGHBOURS
         neighbours = lines.depth_of_delay(share * self._from_all_pixels(time_ns))
-        of_pixel = np.hypot(np.hypot(later, relative), constant.reshape(shape))
+        of_pixel = np.hypot(np.hypot(later, relative), np.hypot(constant.reshape(shape), np.hypot(early, rounding)))
         return np.asarray(np.hypot(of_pixel, neighbours))
 
     def delays(self, depth: FloatArray, backscattering: FloatArray) -> FloatArray:
@@ -164,15 +184,15 @@ class DepthErrors:
         -----
         An event by the angle t at the distance u from the bottom, on the way down or up, lengthens the path by x = u
         (1/cos t - 1) and displaces it by r = u tan t. Each scattering counts with three factors: Petzold's
-        average-particle phase function, for bb/b of 0.0183; the share exp(-r^2/(2 s^2)) of such light in the view, with
-        s^2 = (w/2)^2 + (v/4)^2 for the beam and view diameters w and v; and exp(-x^2/(4 p^2)), by which a fit of a
-        Gaussian with the standard deviation p follows light that is later by x. The sum of b x over the events of one
-        way, half of both ways, is the delay D while it is small. Light later than an echo's width e hardly moves the
-        echo, which thus has the delay D/(1 + D/e).
+        average-particle phase function, for bb/b of 0.0183 without the molecules' bb; the share exp(-r^2/(2 s^2)) of
+        such light in the view, with s^2 = (w/2)^2 + (0.32 v)^2 for the beam and view diameters w and v; and exp(-x^2/(4
+        p^2)), by which a fit of a Gaussian with the standard deviation p follows light that is later by x. The sum of b
+        x over the events of one way, half of both ways, is the delay D while it is small. Light later than an echo's
+        width e hardly moves the echo, which thus has the delay D/(1 + D/e).
         """
         deepest = float(np.nanmax(depth, initial=0.0))
         metres = 0.5e-9 * C0 / self.group_index * self.pulse_ns
-        spread = math.hypot(0.5 * self.beam_width, 0.25 * self.view_width)
+        spread = self._seen
         if min(deepest, metres, spread) <= 0:
             return np.zeros(depth.shape)
         angle = np.geomspace(*_ANGLES)
@@ -184,8 +204,14 @@ class DepthErrors:
         seen = 2 * np.pi * petzold_average_particle()(angle) * np.sin(angle) * np.exp(-0.5 * away**2 - 0.25 * late**2)
         inner = np.asarray(np.trapezoid(seen * longer, angle, axis=1))
         total = np.append(0.0, np.cumsum(0.5 * (inner[1:] + inner[:-1]))) * (distance[1] - distance[0])
-        delay = np.interp(depth, distance, total) * backscattering / PETZOLD_BACKSCATTER_RATIO
+        particles = np.maximum(backscattering - _BY_MOLECULES, 0) / PETZOLD_BACKSCATTER_RATIO
+        delay = np.interp(depth, distance, total) * particles
         return np.asarray(delay / (1 + delay / metres))
+
+    @property
+    def _seen(self) -> float:
+        """Standard deviation of the displacement on the bottom by which light is still seen [m]."""
+        return math.hypot(0.5 * self.beam_width, _OF_VIEW * self.view_width)
 
     def of_scattered_light(self, depth: FloatArray, dark: BoolArray) -> FloatArray:
         """Return the errors of depths [m], shape (n, ...), in pixels without direct light, shape (n,), 0 in others.
@@ -214,7 +240,8 @@ class DepthErrors:
         # The median, as levels of faint columns may be wrong by orders of magnitude.
         some = np.where(np.isfinite(measured).any(axis=1, keepdims=True), measured, 0)
         median = np.nanmedian(some, axis=1, keepdims=True)
-        found = np.broadcast_to(np.where(median > 0, median, np.nan), share.shape).ravel()
+        unknown = ~np.isfinite(measured).any(axis=1, keepdims=True)
+        found = np.broadcast_to(np.where(unknown, np.nan, np.maximum(median, 0)), share.shape).ravel()
         return np.asarray(np.where(np.isfinite(found), found, _TYPICAL_BACKSCATTERING * known))
 
     def _from_all_pixels(self, time_ns: FloatArray) -> FloatArray:

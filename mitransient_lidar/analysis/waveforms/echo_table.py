@@ -11,7 +11,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.waveforms import deconvolution
-from mitransient_lidar.analysis.waveforms.column_fits import change_points, column_echoes, column_fit
+from mitransient_lidar.analysis.waveforms.column_fits import change_points, column_between, column_echoes, column_fit
 from mitransient_lidar.analysis.waveforms.depth_errors import TYPICAL_SLOPE_VARIANCE, DepthErrors
 from mitransient_lidar.analysis.waveforms.echo_classes import IN_AIR, Detection, EchoClass, decide
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, has_echo
@@ -159,11 +159,10 @@ def extract(
     the record's trigger and clocks, which cancels where the pixel's own surface echo counts. The method errs by more:
     For ``gaussian``, ``depth_m_method_error`` states the typical error by waves, by scattered light that arrives later,
     and by the light distribution in the pixel, which the surface echo samples at few places; see
-    `depth_errors.DepthErrors`. Its constants are from 40 random level seas and 36 shots on waves, the delay by
-    scattering from single-scattering theory. In waters IB to 7C at 6 m/s, from 4 m on, the rms error over both errors
-    together was 0.8 to 1.1 for ``published_airborne`` and 0.7 to 1.3 for ``teledyne_czmil``. Depths of 2 m have no
-    column that tells the water: the ratio was 1.0 to 1.7 and 1.2 to 2.2, largest in 7C. The error has the sign of the
-    biases below, which the other estimators have.
+    `depth_errors.DepthErrors`. Its constants are from 40 random level seas and 36 shots on waves; scattering,
+    undercutting and ripples follow from theory. In waters IB to 7C at 6 m/s the rms error over both errors together was
+    0.8 to 1.3 for ``published_airborne``, 2 to 11 m deep. The error has the sign of the biases below, which the other
+    estimators have.
 
     Biases by method over a flat bottom, from three renders each: ``table1`` with 1x1 pixels, ``spectrum`` flat and 0.5
     ns bins. Positive is too deep [m]. In each pair, the first number is the surface bias, the second the bottom bias
@@ -336,6 +335,9 @@ def _measure(waveforms: Waveforms, rows: IntArray, settings: _Settings) -> dict[
     table["class_probability"] = decision.probability
     table["near_ns"], table["near_stderr"] = decision.surfaces()
     table["film_ns"] = decision.films()
+    of_column, short = quantities[0][1].amplitude, [quantities[0][0], *quantities[0][2:]]
+    between = column_between(clear, short, width, reference, waveforms.fading.typical_rate)
+    table["column_level"] = np.where(np.isfinite(of_column), of_column, between)
     table["peak_ns"] = np.where(surface >= 0, reference, np.nan)
     table["clipped_ns"] = time[np.stack(longest_run(saturated), axis=1)]
     per_metre = 0.5 / waveforms.geometry.metres_per_ns
@@ -426,9 +428,10 @@ def _with_depths(
         table[name] = np.where(in_air, per_ns * one, lines.depth_of_delay(one))
     from_mean = settings.depth_from == "mean"
     sensitivity = np.resize(waveforms.sensitivity, waveforms.count)
-    power = table["amplitude"][:, 0, ECHOES.index("column")]
+    power = table.pop("column_level")
     level = np.divide(power, sensitivity, out=np.full(power.shape, np.nan), where=sensitivity > 0)
-    by_water = errors.of_echoes(time, table["depth_m"], table["attenuation"], level, from_mean=from_mean)
+    known = table["depth_m"], table["attenuation"], level
+    by_water = errors.of_echoes(time, *known, width_ns=table["width_ns"], from_mean=from_mean)
     by_water = np.hypot(by_water, errors.of_scattered_light(table["depth_m"], dark))
     # The surface is where depths count from, or an echo of its own.
     by_water[..., 0] = 0

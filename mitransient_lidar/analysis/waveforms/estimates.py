@@ -82,7 +82,10 @@ def estimate(
         first = echo_fits.gaussian_surface(
             records, *surface, reflects=reflects, decay_error=relative, following=following
         )
-        fits = [first]
+        # The surface echo's tail would count as a column before a bottom near it.
+        apart = (records.time_ns - first.time_ns[:, np.newaxis] - shape.peak_ns) / first.width_ns[:, np.newaxis]
+        tail = np.nan_to_num(first.amplitude[:, np.newaxis] * np.exp(-4 * np.log(2) * apart**2))
+        records, fits = replace(records, power=records.power - tail), [first]
         for number, (place, flag) in enumerate(places[1:], 1):
             around = found.neighbours(number)
             fit = echo_fits.gaussian_echo(records, place, width, decay, flag, shape, after=found.surface, around=around)

@@ -25,7 +25,7 @@ from mitransient_lidar.physics.lidar.level_sea import LidarGeometry, surface_tim
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.electronics import LogAmplifier
 from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, pulse_of, required_number
-from mitransient_lidar.results.sum_errors import BlockCorrelation, SumErrors
+from mitransient_lidar.results.sum_errors import BlockCorrelation, SumErrors, pooled_errors
 
 #: Some of the waveforms.
 Rows = IntArray | slice
@@ -386,7 +386,7 @@ def _noise(
             raise UserError(f"noise of shape {given.shape} must be a number, or one per pixel, or per pixel and bin")
         return given.reshape(-1, 1) + np.zeros((pixels, 1)) if given.size <= pixels else given.reshape(pixels, count)
     if name == "waveform" and "waveform_stderr" in dataset:
-        return np.asarray(dataset["waveform_stderr"].values.reshape(-1, count), dtype=np.float64)
+        return np.asarray(pooled_errors(dataset, few=True).values.reshape(-1, count), dtype=np.float64)
     by_receiver = _receiver_noise(dataset, samples, calm, baseline, quiet, run)
     if "signal_mean_stderr" not in dataset:
         return by_receiver

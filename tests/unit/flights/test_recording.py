@@ -1,14 +1,11 @@
-"""Records of the pulses of a flight: automatic settings of the receiver, and errors of renders."""
+"""Records of the pulses of a flight: automatic settings of the receiver."""
 
 import numpy as np
-import significance
 import xarray as xr
-from scipy.stats import t
-from significance import largest_count
 
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.flights.recording import chosen_settings, pooled_errors, record, saturated_pulses
+from mitransient_lidar.flights.recording import chosen_settings, record, saturated_pulses
 
 FLIGHT = {"scene": "flight", "platform": {}, "scanner": {}, "pulses": {"rate_hz": 100}}
 
@@ -79,57 +76,3 @@ def test_each_channel_has_its_own_gain():
     inputs = {"pulse": np.array([0]), **{name: np.array([value]) for name, value in settings.items()}}
     assert record(series, plan, inputs).attrs["gain"] == detect_waveforms(series).attrs["gain"]
     assert settings["receiver_gain_1"] > 1.5 * settings["receiver_gain_0"]
-
-
-def test_pooled_errors_are_those_of_counted_paths():
-    """An echo over a dim column and its tail, as means of 8 passes with Poisson numbers of paths of equal weights."""
-    rng = np.random.default_rng(5 + significance.seed_shift)
-    time = np.arange(120)
-    paths = 4 + 400 * np.exp(-0.5 * ((time - 60) / 4) ** 2)
-    passes = rng.poisson(paths, (8, 400, 2, 120)) / paths.max()
-    waveform, stderr = (
-        xr.DataArray(values, dims=("shot", "pixel", "time"))
-        for values in (passes.mean(axis=0), passes.std(axis=0, ddof=1) / np.sqrt(8))
-    )
-    found = pooled_errors(waveform, stderr, np.full(400, 8)).values
-    true = np.sqrt(paths / 8) / paths.max()
-    ratio = np.sqrt(np.mean(((waveform.values - paths / paths.max()) / found) ** 2, axis=(0, 1)))
-    assert np.all((ratio[20:100] > 0.75) & (ratio[20:100] < 1.02))
-    assert found[..., 60].mean() < 1.25 * true[60]
-
-
-def test_pooled_errors_keep_noise_of_few_passes_from_being_echoes():
-    """Means of 6 passes about a column: 5 of their own standard errors are exceeded by one bin in 240 (Student's t)."""
-    rng = np.random.default_rng(4 + significance.seed_shift)
-    column = np.exp(-0.05 * np.arange(120))
-    passes = column * (1 + 0.3 * rng.standard_normal((6, 500, 2, 120)))
-    waveform, stderr = (
-        xr.DataArray(values, dims=("shot", "pixel", "time"))
-        for values in (passes.mean(axis=0), passes.std(axis=0, ddof=1) / np.sqrt(6))
-    )
-    found = pooled_errors(waveform, stderr, np.full(500, 6))
-    assert np.all(found >= stderr)
-    off = np.abs(waveform - column)
-    bins = off.size
-    assert np.count_nonzero(off > 5 * stderr) > 0.5 * bins * 2 * t.sf(5, 5)
-    assert np.count_nonzero(off > 5 * found) <= largest_count(bins, 2 * t.sf(5, 20))
-    # They are true ones on average, but for what the larger of two errors adds.
-    assert 1.0 < float(np.sqrt(np.mean((found / column) ** 2))) / (0.3 / np.sqrt(6)) < 1.25
-
-
-def test_errors_of_two_passes_hide_no_echo():
-    """Passes whose echoes differ by 8 %: own errors of two of them are over twice the true ones in one shot of 20."""
-    rng = np.random.default_rng(6 + significance.seed_shift)
-    echo = 0.1 + np.exp(-0.5 * ((np.arange(120) - 60) / 3) ** 2)
-    passes = echo * (1 + 0.08 * rng.standard_normal((2, 256, 1, 1)))
-    waveform, stderr = (
-        xr.DataArray(values, dims=("shot", "pixel", "time"))
-        for values in (passes.mean(axis=0), passes.std(axis=0, ddof=1) / np.sqrt(2))
-    )
-    found = pooled_errors(waveform, stderr, np.full(256, 2)).values[..., 60] / echo[60]
-    true = 0.08 / np.sqrt(2)
-    assert np.mean(stderr.values[..., 60] > 2 * true * echo[60]) > 0.02
-    assert np.all((found > 0.75 * true) & (found < 1.5 * true))
-    # A shot of more passes has errors of its own beside them.
-    mixed = pooled_errors(waveform, stderr, np.where(np.arange(256) == 3, 8, 2))
-    assert np.all(mixed.values[3] >= stderr.values[3])

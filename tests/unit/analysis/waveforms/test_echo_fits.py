@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 from scipy.stats import exponnorm
 from significance import largest_count, largest_z
+from synthetic_shots import on_axis
 
 from mitransient_lidar.analysis.waveforms.column_fits import change_points, column_fit
 from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Focusing
@@ -244,3 +245,13 @@ def test_light_that_waves_focus_within_a_column_is_not_the_surface():
     bottom = extract(records).sel(echo="bottom").squeeze("pixel")
     error = np.hypot(bottom.depth_m_stderr, bottom.depth_m_method_error)
     assert (np.abs(bottom.depth_m - records.true_bottom_depth_below_surface) < 3 * error).all()
+
+
+@pytest.mark.parametrize("depth", [0.85, 0.95, 1.2])
+def test_bottom_near_a_bright_surface_echo_is_no_later(depth):
+    """Two to three echo widths behind a bright surface, whose tail would count as a column before the bottom."""
+    near, far = (
+        float(extract(on_axis(depth=d, glint=3e-10), depth_from="mean")["depth_m"].sel(echo="bottom")[0]) - d
+        for d in (depth, 3.0)
+    )
+    assert near == pytest.approx(far, abs=0.004)
