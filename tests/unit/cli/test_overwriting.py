@@ -1,5 +1,6 @@
 """Which existing files each command replaces, and which it keeps before it renders."""
 
+import functools
 import os
 import shutil
 
@@ -255,11 +256,13 @@ def test_file_made_meanwhile_keeps_its_name(folder, monkeypatch):
     """The new one gets another, so that no render is lost."""
     from mitransient_lidar.studies import light_classes
 
+    found = light_classes.scattering
+
+    @functools.wraps(found)
     def slow(*arguments, **options):
         (folder / "d/f.nc").write_text("mine")
         return found(*arguments, **options)
 
-    found = light_classes.scattering
     stub(monkeypatch, "scattering", slow)
     done = run("scattering", "table1", "--depths", 2, "--passes", 2, "-o", "d/f.png")
     assert done.exit_code == 0
