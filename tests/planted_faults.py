@@ -298,7 +298,7 @@ FAULTS = (
         near=f"{_UNIT}/analysis",
     ),
     Fault(
-        *("parabola_turned", f"{_A}/detection/statistics.py"),
+        *("parabola_turned", f"{_A}/detection/matched_filter.py"),
         "0.5 * (left - right)",
         "0.5 * (right - left)",
         near=f"{_UNIT}/analysis/detection",

@@ -6,12 +6,11 @@ from rows import each_row
 from scipy.stats import chi2, norm, pearson3
 from significance import FALSE_ALARM, largest_z
 
+from mitransient_lidar.analysis.detection.matched_filter import delay_bound, delays
 from mitransient_lidar.analysis.detection.statistics import (
     Cases,
     Statistic,
     clutter_covariance,
-    delay_bound,
-    delays,
     matched_weights,
     sample_moments,
     within_range,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mitransient_lidar.analysis.information.fisher import bounds
+from mitransient_lidar.analysis.information.cramer_rao import bounds
 
 
 def test_bounds_of_two_parameters_in_closed_form():
