@@ -23,6 +23,7 @@ from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.clear_sky import background_power
 from mitransient_lidar.rendering import passes as engine
 from mitransient_lidar.rendering.accuracy import PassStatistics, RatioStatistics, smoothing_bias
+from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.results.attributes import label, titled
 from mitransient_lidar.transport.daylight.renderer import DaylightRenderer, pixel_solid_angles, share_outside_surface
 from mitransient_lidar.transport.sensor.pixels import PixelArray
@@ -70,7 +71,7 @@ def render_passive(
         ),
     ] = None,
     variant: engine.Variant = None,
-    progress: engine.ProgressCallback | None = None,
+    progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render the radiance that the receiver sees by daylight.
 
@@ -198,7 +199,7 @@ def _render_frame(
     renderer: DaylightRenderer,
     goal: engine.Goal,
     seed: int,
-    progress: engine.ProgressCallback | None,
+    progress: ProgressCallback | None,
     smooth: float | None,
 ) -> tuple[RatioStatistics, engine.PassLog, float, float]:
     """Render one frame's passes; return statistics, log, light share lost at the surface's edge, and bias.

@@ -24,6 +24,7 @@ from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.derivatives import Differences, path_parameters, perturbations
 from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
 from mitransient_lidar.rendering.pass_size import describe_cost, fit_to_time
+from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.rendering.scene_checks import check_scene, warn_of_shadows
 from mitransient_lidar.rendering.shots.frames import render_frames
@@ -64,7 +65,7 @@ def render(
     smooth: engine.Smooth = None,
     light: engine.Light = None,
     variant: engine.Variant = None,
-    progress: engine.ProgressCallback | None = None,
+    progress: ProgressCallback | None = None,
     **others: Any,
 ) -> xarray.Dataset:
     """Render a lidar scene in independent passes until it is accurate enough, or a result again.
@@ -203,7 +204,7 @@ def _render(
     session: LoadedScene,
     integrator: str | Mapping[str, Any] | mi.Integrator | None,
     options: engine.RenderOptions,
-    progress: engine.ProgressCallback | None,
+    progress: ProgressCallback | None,
 ) -> xarray.Dataset:
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0

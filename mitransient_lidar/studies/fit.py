@@ -17,7 +17,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.information import alignment
 from mitransient_lidar.analysis.information.alignment import BANDWIDTH
-from mitransient_lidar.analysis.information.fisher import SCALE, TIME_OFFSET
+from mitransient_lidar.analysis.information.cramer_rao import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.fits import Model, WaveformFit
 from mitransient_lidar.analysis.information.measured import measured, with_waveforms
 from mitransient_lidar.core.errors import UserError

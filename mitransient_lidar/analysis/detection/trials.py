@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.analysis.detection import statistics
+from mitransient_lidar.analysis.detection import matched_filter, statistics
 from mitransient_lidar.analysis.information.errors import jackknife_error
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
@@ -261,10 +261,10 @@ def depth_errors(trial: Experiment, shots: int, seed: int, pulse_fwhm_ns: float,
                 known = cases if count == 1 else cases.others(i)
                 noise = known.covariance(with_target=True)
                 times.append(
-                    statistics.delays(record[:, i] @ matrix.T - known.null_mean.mean(axis=0), echo, steps, noise)
+                    matched_filter.delays(record[:, i] @ matrix.T - known.null_mean.mean(axis=0), echo, steps, noise)
                 )
             depths[name] = metres_per_ns * np.array(times)
-            bounds[name] = metres_per_ns * statistics.delay_bound(echo, steps, noise) if count == 1 else math.nan
+            bounds[name] = metres_per_ns * matched_filter.delay_bound(echo, steps, noise) if count == 1 else math.nan
     levels, bias = {}, []
     for name in COMBINATIONS:
         groups = list(depths[name]) if count > 1 else np.array_split(depths[name][0], _GROUPS)

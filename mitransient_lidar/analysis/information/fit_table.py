@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
+from mitransient_lidar.analysis.information.cramer_rao import Free
 from mitransient_lidar.analysis.information.errors import Errors, refusal_of_unknown_noise
-from mitransient_lidar.analysis.information.fisher import Free
 from mitransient_lidar.analysis.information.measured import Measured
 from mitransient_lidar.core.parameters.catalogue import unit_of
 from mitransient_lidar.core.validation import FloatArray

@@ -17,8 +17,8 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.analysis.information.alignment import Misfit, best_offset, light_duration, residual_correlation
+from mitransient_lidar.analysis.information.cramer_rao import SCALE, TIME_OFFSET, free_parameters
 from mitransient_lidar.analysis.information.errors import NO_BATCHES, Errors, estimate_errors, smoothed_variance
-from mitransient_lidar.analysis.information.fisher import SCALE, TIME_OFFSET, free_parameters
 from mitransient_lidar.analysis.information.fit_table import FittedSamples, fit_table
 from mitransient_lidar.analysis.information.measured import Measured, Prediction, predict
 from mitransient_lidar.core.errors import UserError

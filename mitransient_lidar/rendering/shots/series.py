@@ -28,6 +28,7 @@ from mitransient_lidar.loading.scenes import LoadedScene, open_scene
 from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering import passes as engine
+from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shots.batches import (
     MOST_PASSES_FOR_ERROR,
     ReceivedShots,
@@ -107,7 +108,7 @@ def render_shots(
     sensor: Sensor = None,
     describe_sea: bool = True,
     merge_unsuited: bool = False,
-    progress: engine.ProgressCallback | None = None,
+    progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render shots at given or random locations on one sea, many at a time.
 

@@ -6,14 +6,13 @@ from rows import refuses
 from scipy.stats import binom, chi2, norm, pearson3
 from significance import FALSE_ALARM, largest_z
 
+from mitransient_lidar.analysis.detection.matched_filter import delay_bound, delays
 from mitransient_lidar.analysis.detection.statistics import (
     Cases,
     Statistic,
     area_under_curve,
     binomial_rates,
     clutter_covariance,
-    delay_bound,
-    delays,
     exceedance,
     matched_weights,
     sample_moments,
