@@ -39,6 +39,8 @@ _TWICE, _SECOND = 0.1, 5.0  # of a peak, light that meets the bottom twice, and 
 _RETURNS, _BRIGHTEST = (2.2, 3.2), 0.5
 # Standard errors of a column's energy that make the echo before it the surface's, and its length [ns].
 _COLUMN, _COLUMN_NS = 5.0, 20.0
+_OVER_BOTTOM = 0.9  # least probability of a clear surface without a column that may rather be a bottom than land
+_CLEAR = 8.0  # least height over the noise of clear echoes
 _SHALLOW = 2.0  # largest depth of bottoms that are told from first echoes [m]
 _OPEN = 2.0  # least length of a column between two echoes that tells a weak surface, in echo widths
 
@@ -124,8 +126,9 @@ def decide(
     An echo that is more than 4 standard deviations before the surface's level, and 1.2 echo widths before others, is an
     object above the water. First echoes without others, or with others nearer than 1.8 echo widths, are those of
     `first_echoes.first_echoes`, unless they are at the surface's level and a column follows them. The likeliest of
-    land, surface and bottom counts, however faint the echo is. In the near infrared, where column and bottom are part
-    of the surface's echo, a first echo is land or the surface, and nothing follows the surface.
+    land, surface and bottom counts, however faint the echo is. Above 8 standard errors, a bottom that is likelier than
+    land is preferred to a surface without a column whose probability is below 90 %. In the near infrared, where column
+    and bottom are part of the surface's echo, a first echo is land or the surface, and nothing follows the surface.
 
     150 records of each kind were drawn: VQ-880-G II at nadir and 600 m, a level known to 0.15 m, glints from none to
     five times the bottom's echo, reflectances 0.05 to 0.4. All land from 0.2 to 4 m is land, and 99 % of the bottoms
@@ -203,6 +206,8 @@ def decide(
     is_shallow = records.time_of(np.where(by_following, following, found.surface)) < farthest
     # An echo at the record's end may have a column behind it.
     left = records.time_ns[-1] - records.time_of(found.surface)
+    behind = np.minimum(following, last - 1)
+    is_clear = ~_is_weak(records, found.surface, _CLEAR) | (near & ~_is_weak(records, behind, _CLEAR))
     is_whole = left > waveforms.tail_ns + _COLUMN_NS
     opaque = waveforms.fading.opaque
     if opaque:
@@ -239,7 +244,7 @@ def decide(
     extent = np.where(near[tested], (following[tested] - peak) * records.bin_ns + width, 0.0)
     first = first_echoes(records.part(tested), peak, pulse, shape, width, priors, extent)
     land, sea, bottom = first.chance
-    decided = sea < np.maximum(land, bottom)
+    decided = sea < np.where(is_clear[tested] & (bottom > land), _OVER_BOTTOM, np.maximum(land, bottom))
     probability[tested] = np.where(decided, np.maximum(land, bottom), sea)
     return _decided(Decision(found, above, probability, tested[decided], first.part(decided)), records, shape, width)
 
@@ -276,10 +281,10 @@ def _following(found: DetectedEchoes, last: int) -> IntArray:
     return np.asarray(np.where(found.bins[1:] > found.surface, found.bins[1:], last).min(axis=0))
 
 
-def _is_weak(records: Records, bins: IntArray) -> BoolArray:
+def _is_weak(records: Records, bins: IntArray, least: float = _WEAK) -> BoolArray:
     """Return which peaks are so weak that the time of an echo there is not well known."""
     rows, at = np.arange(len(bins)), np.maximum(bins, 0)
-    return np.asarray(records.power[rows, at] < _WEAK * np.broadcast_to(records.noise, records.power.shape)[rows, at])
+    return np.asarray(records.power[rows, at] < least * np.broadcast_to(records.noise, records.power.shape)[rows, at])
 
 
 def _is_weak_behind(
