@@ -176,7 +176,7 @@ class LidarMerging(LidarPassIntegrator):
         + \kappa \sum_i \frac{d_i^2}{b_i p_i\, T_i\, b_{i+1} p_{i+1}}\Big)^{-1},
 
     which is bounded by the event of the smallest :math:`b_i p_i`, so that the forward peak does not cause noise. Paths
-    that meet a solid are merged only at the first one from the receiver. Or they are connected to it from the last
+    that meet a solid are merged only at the first one from the receiver, or connected to it from the last
     scattering event before. There are no connections in water with bubbles or with several refractive indices, nor
     under water.
 

@@ -173,7 +173,7 @@ def waveform(energy: ArrayLike, bin_width_ns: float, kernel: tuple[int, FloatArr
     Parameters
     ----------
     energy : array_like, shape (..., time)
-        Energy per bin [J], of at least one bin.
+        Energy per bin [J]; at least one bin.
     bin_width_ns : float
         Bin width [ns], positive, the kernel's.
     kernel : (int, ndarray)
