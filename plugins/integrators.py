@@ -160,10 +160,10 @@ class LidarMerging(LidarPassIntegrator):
     them over any distance. Light that is scattered into or out of a narrow beam far from the axis rarely meets a small
     cell. Connections find it (Georgiev et al. 2012, doi:10.1145/2366145.2366211).
 
-    A path with several scattering events can arise from a merge at each of them, and from a connection between any two
-    that follow each other. The balance heuristic (Veach and Guibas 1995, doi:10.1145/218380.218498) weights all. With
-    coefficient :math:`b_i`, phase function :math:`p_i` and cell volume :math:`V_i` at each event, the length
-    :math:`d_i` and the transmittance of scattering :math:`T_i` of the segment to the next one, and the share
+    A path with several scattering events can arise from a merge at each of them. It can also arise from a connection
+    between any two that follow each other. The balance heuristic (Veach and Guibas 1995, doi:10.1145/218380.218498)
+    weights all. With coefficient :math:`b_i`, phase function :math:`p_i` and cell volume :math:`V_i` at each event, the
+    length :math:`d_i` and the transmittance of scattering :math:`T_i` of the segment to the next one, and the share
     :math:`\kappa` of the pairs of points that are connected, each pair of points of weights *w* and *w'* adds
 
     .. math::
@@ -172,8 +172,9 @@ class LidarMerging(LidarPassIntegrator):
         + \kappa \sum_i \frac{d_i^2}{b_i p_i\, T_i\, b_{i+1} p_{i+1}}\Big)^{-1},
 
     which is bounded by the event of the smallest :math:`b_i p_i`, so that the forward peak does not cause noise. Paths
-    that meet a solid are merged only at the first one from the receiver, or connected to it from the last scattering
-    event before. There are no connections in water with bubbles or with several refractive indices, nor under water.
+    that meet a solid are merged only at the first one from the receiver, or connected to it from the last
+    scattering event before. There are no connections in water with bubbles or with several refractive indices, nor
+    under water.
 
     Around a laser under water, cells are shells cut into rings and sectors about its axis. They are thinner and
     narrower near the laser, where light and view are concentrated. Cell volumes differ along a path. With the cell

@@ -51,8 +51,8 @@ class FournierForand(TabulatedPhaseFunction):
     .. parameters::
 
     Scattering by particles with a power-law size distribution (Fournier and Forand 1994; closed form of Fournier and
-    Jonasz 1999). A backscatter ratio alone picks index and slope on the line
-    :math:`n = 1.01 + 0.1542 (\mu - 3)` (Mobley, Sundman and Boss 2002, doi:10.1364/AO.41.001035).
+    Jonasz 1999). A backscatter ratio alone picks index and slope. They lie on the line :math:`n = 1.01 + 0.1542 (\mu -
+    3)` (Mobley, Sundman and Boss 2002, doi:10.1364/AO.41.001035).
 
     The function has a singularity at 0 degrees. It is tabulated as power laws of :math:`s = \sin^2(\theta/2)` over
     twelve decades and sampled exactly, including angles below 2 microradian.

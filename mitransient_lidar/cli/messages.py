@@ -180,8 +180,11 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
     from rich.table import Column
 
     console = _console()
-    handler = RichHandler(console=console, show_path=False, show_time=False)
-    handler.setFormatter(_PrintableLog("%(message)s"))
+    handler: logging.Handler = logging.StreamHandler(console.file)  # which wraps no lines
+    handler.setFormatter(_PrintableLog("%(levelname)-8s %(message)s"))
+    if console.is_terminal:
+        handler = RichHandler(console=console, show_path=False, show_time=False)
+        handler.setFormatter(_PrintableLog("%(message)s"))
     with _logging(handler, logging.INFO, propagate=True):
         description = TextColumn("{task.description}", table_column=Column(no_wrap=False, ratio=1))
         columns = (SpinnerColumn(), description, BarColumn(bar_width=16), TimeElapsedColumn())

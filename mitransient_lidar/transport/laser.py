@@ -136,7 +136,7 @@ class TopHatBeam(_Ellipse):
 class ImageBeam(BeamProfile):
     """Measured beam: uniform irradiance within each cell of an image that is centred on the optical axis.
 
-    `irradiance`: image in any unit, shape (rows, columns), 1 to 2048 each: row 0 is the far edge (+angle_x), column 0
+    `irradiance`: image in any unit, shape (rows, columns), 1 to 2048 each. Row 0 is the far edge (+angle_x), column 0
     the left one (+angle_y). Finite, not negative, not all 0; else UserError. `side`: full angle [rad] from the first
     column's outer edge to the last one's, positive. Cells are squares.
     """

@@ -110,10 +110,10 @@ def fit_plane(
     tilt) d. The face's tilt is assumed to be half the estimate, with this uncertainty. Hence faces away from the lidar
     have larger errors. Errors in adjacent pixels, which the same crests cross, have a correlation of 0.4 that falls
     with the distance in angle_x as exp(-dx^2/(2 spread^2)). It raises the error along and lowers the error across. One
-    facet per pixel and 0.4 come from 600 rendered shots at 6 m/s along the wind, 20 degrees off nadir, views of 15 and
-    30 mrad. Pixel centres had errors of 0.85 to 1.13 spreads, with correlations of 0.30 to 0.43 between adjacent pixels
-    and -0.24 to 0.18 otherwise. The rms ratio of error to stated error is 1.04 to 1.28 along, 0.78 to 0.91 across, and
-    0.86 to 1.00 with a prior. In 120 shots across the wind, it is 0.81 to 1.24.
+    facet per pixel and 0.4 come from 600 rendered shots at 6 m/s along the wind. They look 20 degrees off nadir, with
+    views of 15 and 30 mrad. Pixel centres had errors of 0.85 to 1.13 spreads, with correlations of 0.30 to 0.43 between
+    adjacent pixels and -0.24 to 0.18 otherwise. The rms ratio of error to stated error is 1.04 to 1.28 along, 0.78 to
+    0.91 across, and 0.86 to 1.00 with a prior. In 120 shots across the wind, it is 0.81 to 1.24.
 
     Pixels narrow in angle_x are best, since it determines the time. Pixels that cut a wide beam have skewed light, and
     a symmetric echo fit lies too near to the axis. A level sea then appears to face the lidar by up to 1.5 degrees.

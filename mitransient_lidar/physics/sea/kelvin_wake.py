@@ -82,7 +82,7 @@ def kelvin_wake(
     resistance is ``(pi/2) rho U^2 integral |A|^2 cos(theta)^3 dtheta`` (Newman 1977), Michell's integral.
 
     Only these free waves are included, not the local elevation about the hull, so that heights next to the hull are
-    rough. Ahead of the ship's middle the integral yields mirrored, negated waves, which are removed; the others grow
+    rough. Ahead of the ship's middle the integral yields mirrored, negated waves, which are removed. The others grow
     smoothly from 0 amidships to their full height at the stern. The theory exaggerates the short steep waves on the
     track, where a real ship leaves turbulent water.
 

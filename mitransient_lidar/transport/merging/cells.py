@@ -339,7 +339,8 @@ class SphericalCells:
     """Cells about the laser, small where its light is concentrated, for a scene or for one pass.
 
     Angles from the axis are measured by the tangent of their half, up to the opposite direction. Rings are of equal
-    width in asinh(tan(theta / 2) / core), and shells in log(r) up to the radius where they have their final thickness.
+    width in asinh(tan(theta / 2) / core). Shells are of equal width in log(r), up to the radius where they have their
+    final thickness.
 
     `scene`: scene with laser and receiver under water. `thickness`: largest shell thickness [m].
     """

@@ -353,8 +353,8 @@ _ROOT3 = math.sqrt(3.0)
 class HexPixels(PixelArray):
     """A hexagon and rings of hexagons around it, in rows along angle_y.
 
-    The field of view is the circumscribed circle about the axis. For N hexagons with side s its radius is sqrt(N) s,
-    and they fill 3 sqrt(3) / (2 pi) = 82.7 % of it for any N.
+    The field of view is the circumscribed circle about the axis. For N hexagons with side s its radius is sqrt(N) s.
+    They fill 3 sqrt(3) / (2 pi) = 82.7 % of it for any N.
 
     The array without its central hexagon is three parallelograms of n x (n + 1) hexagons for n rings. Points are drawn
     in these and assigned to hexagons afterwards, at a cost that does not depend on N.

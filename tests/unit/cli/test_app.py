@@ -160,6 +160,7 @@ def test_unwritable_output_is_noticed_before_rendering(scene, calls, tmp_path):
 #: Sets colour and title of a terminal, rings, and turns the order of letters.
 STEERING = "\x1b[31mred\x1b]0;title\x07\u202e"
 SHOWN = r"\x1b[31mred\x1b]0;title\x07\u202e"
+LONG = " and long" * 20
 
 
 def test_control_characters_do_not_reach_the_terminal(scene, calls, tmp_path, monkeypatch):
@@ -169,7 +170,7 @@ def test_control_characters_do_not_reach_the_terminal(scene, calls, tmp_path, mo
     built = results.build
 
     def build(*arrays, **options):
-        logging.getLogger("mitransient_lidar.test").warning("%s is odd", STEERING)
+        logging.getLogger("mitransient_lidar.test").warning("%s is odd%s", STEERING, LONG)
         return built(*arrays, **{**options, "pixel_names": [STEERING, "green"]})
 
     monkeypatch.setattr(results, "build", build)
@@ -177,7 +178,7 @@ def test_control_characters_do_not_reach_the_terminal(scene, calls, tmp_path, mo
     assert done.exit_code == 0, done.output
     assert not set(done.stdout + done.stderr) & set(STEERING) - set("[31mred]0;title")
     text = "".join(done.stderr.split())
-    assert f"{SHOWN}isodd" in text
+    assert f"WARNING  {SHOWN} is odd{LONG}\n" in done.stderr  # in one line where there is no terminal
     assert f"peakpower,{SHOWN}(W)" in text
 
 
