@@ -8,7 +8,8 @@ from differentiated import PHOTON, result
 from rows import refuses
 from significance import largest_chi2, largest_z
 
-from mitransient_lidar.analysis.information.cramer_rao import bounds, fisher_information
+from mitransient_lidar.analysis.information.cramer_rao import bounds
+from mitransient_lidar.analysis.information.fisher import fisher_information
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
