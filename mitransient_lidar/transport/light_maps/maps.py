@@ -188,8 +188,8 @@ class LightMaps:
         entries = origins - axes * (origins[:, 2] / axes[:, 2])[:, None]
         below = np.array([refract_level(axis, scene.refractive_index) for axis in axes])
         tilts = below[:, :2] / -below[:, 2:]
-        #: Length by which light is later along level water [1]: the horizontal part of the axis in the air.
-        self._entry, self._tilt, self.later = (
+        # Along level water light is later by the horizontal part of the axis in the air [1].
+        self._entry, self._tilt, self._later = (
             mi.Vector2f(*(aligned(mi.Float, column.astype(np.float32)) for column in each.T))
             for each in (entries[:, :2], tilts, axes[:, :2])
         )
@@ -224,7 +224,7 @@ class LightMaps:
         inside = (i >= 0) & (j >= 0) & (i < cells) & (j < cells)
         cell = mi.UInt32(dr.select(inside, j, 0)) * cells + mi.UInt32(dr.select(inside, i, 0))
         level = (
-            lanes.pick(self._to_entry) + lanes.pick(self._per_depth) * depth + dr.dot(beside, lanes.pick(self.later))
+            lanes.pick(self._to_entry) + lanes.pick(self._per_depth) * depth + dr.dot(beside, lanes.pick(self._later))
         )
         return (lanes.shot * self.count + plane) * cells**2 + cell, inside, level
 

@@ -36,7 +36,7 @@ from mitransient_lidar.transport.sensor.receiver import SensorSample
 from mitransient_lidar.transport.solids import met_shape
 
 #: Numbers of the random sequences within a pass.
-_BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS, _BEHIND = range(6)
+_BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS, _BEHIND, _TARGETS = range(7)
 
 #: Planes of maps below the mean sea level, and paths of scattered light at each depth.
 _PLANES, _PATHS = 16, 2**12
@@ -62,7 +62,7 @@ _RAYS_PER_PIXEL, _FEWEST_RAYS, _MOST_RAYS = 16, 2**15, 2**21
 _CELLS_PER_WAVE, _MOST_CELLS, _BEAM_PER_CELL = 2.5, 480, 4
 
 #: Memory of a cell of the maps, and of a ray of the beam and the view [bytes].
-_BYTES_PER_CELL, _BYTES_PER_BEAM, _BYTES_PER_RAY = 12, 60, 136
+_BYTES_PER_CELL, _BYTES_PER_BEAM, _BYTES_PER_RAY = 12, 60, 128
 
 #: Distance beyond all waves that focus light [m].
 _FAR = 1e3
@@ -113,9 +113,8 @@ class _Rays:
 class _Seen:
     """Rays of the view in the water, and what they meet there."""
 
-    #: The rays, their tangent-plane angles in the air, and the pixel of each.
+    #: The rays, and the pixel of each.
     rays: _Rays
-    angles: mi.Point2f
     pixel: mi.UInt32
     surface_length: mi.Float  #: Relative optical length by the point of the sea to the transmitter [m].
     #: Distance to the bottom [m], place there, and number of the solid.
@@ -184,10 +183,11 @@ class LightMapRenderer(PassRenderer):
     def memory(self) -> tuple[float, float]:
         """Memory of maps, and of rays for each received pixel [bytes]."""
         beams, of_maps = self.paths * self._sampling.beam, self._planes.depths.size * self._planes.cells**2
-        of_all, of_rays = _BYTES_PER_CELL * of_maps + _BYTES_PER_BEAM * beams, _BYTES_PER_RAY * self.paths
-        if self._targets is not None:
-            return of_all + 2 * of_rays, 0.0
-        return of_all, of_rays / self.scene.receiver.pixels.count
+        of_ray = _BYTES_PER_RAY * (1 if self._targets is None else 2)
+        return (
+            _BYTES_PER_CELL * of_maps + _BYTES_PER_BEAM * beams,
+            of_ray * self.paths / self.scene.receiver.pixels.count,
+        )
 
     @property
     def used_values(self) -> dict[str, float]:
@@ -210,13 +210,13 @@ class LightMapRenderer(PassRenderer):
             self._return(received, shots, paths, maps, seen, lanes, origin)
         for one in behind:
             self._return(received, shots, paths, maps, one, lanes, _BEHIND)
+            self._return(received, shots, paths, maps, seen, lanes, _TARGETS)
 
     def _sample(self, received: ReceivedLight, shots: Shots, count: int, purpose: int) -> tuple[Lanes, SensorSample]:
         """Return `count` rays of the view, or those of the tile's pixels."""
         lanes = shots.paths(count)
         sample = self.sampler.sample_shots(lanes, count, shots.streams(purpose, lanes))
-        if received.tile is None or self._targets is not None:
-            # Light of targets scatters into other tiles.
+        if received.tile is None:
             return lanes, sample
         first, size = map(opaque_index, (received.tile.start, len(received.tile)))
         own = dr.compress((sample.weight > 0) & (sample.pixel - first < size))
@@ -333,7 +333,6 @@ class LightMapRenderer(PassRenderer):
         slope = mi.Vector2f(-bed.n.x / bed.n.z, -bed.n.y / bed.n.z)
         return _Seen(
             rays,
-            sample.angles,
             mi.UInt32(sample.pixel),
             by_surface,
             dr.select(on_bed, bed.t, _NO_BED),
@@ -355,9 +354,10 @@ class LightMapRenderer(PassRenderer):
         own: Lanes,
         origin: int,
     ) -> None:
-        """Add the light that returns from the water, or from the bottom, to rays of the view, `own` of the `count`.
+        """Add the light that returns from the water or the bottom to rays of the view, `own` of the `count`.
 
-        From behind targets comes light that has scattered beside them.
+        From a bottom behind targets, and from targets, comes scattered light alone. A target meets the ways up to a
+        depth of its own, so that its light arrives in all pixels.
         """
         scene, water, from_bed, targets = self.scene, self.scene.required_water, origin != _WATER, self._targets
         per_ray, each = (
@@ -377,61 +377,67 @@ class LightMapRenderer(PassRenderer):
         rays, thickness = seen.rays, opaque(float(self._planes.depths[-1]) / self._sampling.depths)
         # Before all light is received: a new number in memory ends the kernel.
         down, group_index = -rays.direction.z, opaque(scene.group_index)
-        if from_bed:
-            along, place, path = seen.to_bed, seen.bed, (mi.Float(part) + path) / per_ray
-            active, turned = rays.active & (along < _NO_BED), seen.turned
+        line, part_of = mi.Ray3f(rays.point, rays.direction), (mi.Float(part) + path) / per_ray
+        if origin == _TARGETS and targets is not None:
+            active, path, target, along = rays.active, part_of, *targets.draw(rays.point, down, u)
+        elif from_bed:
+            along, place, path = seen.to_bed, seen.bed, part_of
+            active, turned, solid = rays.active & (along < _NO_BED), seen.turned, seen.solid
         else:
             along = thickness * (mi.Float(part) + u) / down
-            place = rays.point + rays.direction * along
+            place = line(along)
             active, layer = rays.active & (along < seen.to_bottom), water.scattering_flight.layer_at(-place.z)
-            turned = dr.gather(mi.Float, self._turned, layer) * thickness / dr.square(down)
+            turned, solid = dr.gather(mi.Float, self._turned, layer) * thickness / dr.square(down), mi.UInt32(0)
+        # Scattering, from the next plane's paths.
+        plane = dr.maximum(maps.plane_at(along * down, pick), 1)
+        entry = (plane - 1) * _PATHS + dr.minimum(mi.UInt32(path * _PATHS), _PATHS - 1)
+        scale = along * down / maps.depth_of(plane)
+        x, y, excess, of_bed, of_water = (dr.gather(mi.Float, one, entry) for one in self._spread)
+        shift, excess, above, passes = mi.Vector3f(x, y, 0) * scale, excess * scale, pick, active
+        if targets is not None:
+            moved = lanes.pick(scene)
+            solids, (up, of_down, of_up) = self._solids_of(moved), targets.ways(entry, scale)
+            if origin == _TARGETS:
+                met = targets.meet(solids, line, along, up, of_up, target, active)
+                place, active, solid = met.p, active & met.is_valid(), self.classes.solid(met_shape(met))
+                value = met.bsdf().eval(mi.BSDFContext(), moved.on_shapes(met), met.to_local(-line.d), active)[0]
+                turned, along, shift = targets.count * value / down, (line.o.z - place.z) / down, shift - up
+                ends, passes = [(place - line.d * along + shift, of_down, place)], active
+            else:
+                # The plane below a target is in its shadow.
+                above = dr.select(along + maps.step / down > seen.to_target, 0, pick)
+                end = place + up
+                ends = [(line.o, of_up, end), (line.o + shift, of_down, end)]
+                passes = active & ~(from_bed & (along == seen.to_target))
+            passes = targets.let_pass(solids, line.d * along, ends, passes)
         absorbed, scattered = (
             flight.optical_depth(-rays.point.z, down, along)
             for flight in (water.absorption_flight, water.scattering_flight)
         )
         kept = opaque(scene.transmitter.energy) * rays.weight * dr.exp(-absorbed) * turned
         length, depth = rays.length + group_index * along, -place.z
-        turns, solid = mi.UInt32(0 if from_bed else 1), seen.solid if from_bed else mi.UInt32(0)
+        turns = mi.UInt32(0 if from_bed else 1)
 
-        def receive(
-            events: mi.UInt32, length: mi.Float, energy: mi.Float, active: mi.Bool, pixel: mi.UInt32 = seen.pixel
-        ) -> None:
+        def receive(events: mi.UInt32, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
             echo = Echo(seen.surface_length, from_bed)
-            received.receive(pixel, turns + events, mi.UInt32(1), solid, length, energy, active & (energy > 0), echo)
+            received.receive(
+                seen.pixel, turns + events, mi.UInt32(1), solid, length, energy, active & (energy > 0), echo
+            )
 
-        # Scattering, from the next plane's paths.
-        plane = dr.maximum(maps.plane_at(along * down, pick), 1)
-        entry = (plane - 1) * _PATHS + dr.minimum(mi.UInt32(path * _PATHS), _PATHS - 1)
-        scale = along * down / maps.depth_of(plane)
-        x, y, excess, of_bed, of_water = (dr.gather(mi.Float, one, entry) for one in self._spread)
-        shift, excess, pixel = mi.Vector3f(x, y, 0) * scale, excess * scale, seen.pixel
-        if from_bed:
-            # Half of the displacement lies on the way up.
-            lower = dr.clip(-seen.slope.x * shift.x - seen.slope.y * shift.y, -self._relief, self._relief)
-            excess += lower / down if targets is None else dr.select(along == seen.to_target, 0, lower / down)
-        detour = group_index * excess
-        above, passes = pick, active
-        if targets is not None:
-            # The plane below a target is in its shadow.
-            above = dr.select(along + maps.step / down > seen.to_target, 0, pick)
-            solids, on_target = self._solids_of(lanes.pick(scene)), from_bed & (along == seen.to_target)
-            line = mi.Ray3f(rays.point, rays.direction)
-            moved, aside, passes = targets.ways(solids, line, along, shift, on_target, entry, scale, active)
-            shift -= moved
-            detour -= dr.dot(mi.Vector2f(moved.x, moved.y), lanes.pick(maps.later))
-            beside, seen_there = scene.receiver.pixels.pixel_at(seen.angles.x - aside.x, seen.angles.y - aside.y, u)
-            pixel = dr.select(on_target, beside, pixel)
-            passes &= ~on_target | (seen_there > 0)
         # Light without scattering, at the bottom once for each ray.
-        if origin != _BEHIND:
+        if origin in (_WATER, _BOTTOM):
             lit, way = maps.look_up(lanes, place, depth, above, scattered=False)
             once = active & (part == 0) if from_bed else active & (along < seen.to_bed)
             receive(mi.UInt32(0), length + way, kept * dr.exp(-scattered) * lit, once)
         # Light that has scattered on one of the ways or both.
         lit, way = maps.look_up(lanes, place + shift, depth, pick, scattered=True)
-        energy = kept * (1 - dr.exp(-2 * scattered)) * (of_bed / per_ray if from_bed else of_water) * lit
-        events = dr.gather(mi.UInt32, self._events, entry)
-        receive(events, length + way + detour, energy, passes, pixel)
+        share = (1 - dr.exp(-2 * scattered)) * (of_bed / per_ray if from_bed else of_water)
+        if origin in (_BOTTOM, _BEHIND):
+            # Half of the displacement lies on the way up.
+            lower = -seen.slope.x * shift.x - seen.slope.y * shift.y
+            excess += dr.clip(lower, -self._relief, self._relief) / down
+        energy = kept * share * lit
+        receive(dr.gather(mi.UInt32, self._events, entry), length + way + group_index * excess, energy, passes)
 
 
 def _spread_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -19,9 +20,6 @@ _FACES, _BEYOND = 6, 1e-4
 #: Distance before the end of a line at which it no longer meets what it ends on [m].
 _BEFORE = 1e-3
 
-#: Angle over which places of rays are taken as linear [rad].
-_ANGLE = 1e-3
-
 
 class Targets:
     """A scene's targets, and the ways of scattered light past them or to them.
@@ -31,17 +29,57 @@ class Targets:
     """
 
     def __init__(self, scene: LidarScene, spread: TwoWaySpread) -> None:
+        self.count = len(scene.targets)  #: Number of targets.
         self._numbers = [opaque_index(shape_number(target)) for target in scene.targets]
-        pose = scene.receiver.pose
-        directions = pose.directions(_ANGLE * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]))
-        rays = np.broadcast_to(directions[:, None], (4, spread.depths.size, 3))
-        places = scene.level_sea.at_height(pose.origin, rays, -spread.depths)
-        per_angle = np.stack([places[0] - places[1], places[2] - places[3]], axis=-1) / (2 * _ANGLE)
-        aside = np.einsum("dij,jdp->idp", np.linalg.inv(per_angle), np.stack([spread.up_x, spread.up_y]))
+        heights = np.array([float(target.bbox().center().z) for target in scene.targets])
+        self._heights = aligned(mi.Float, heights.astype(np.float32))
         self._ways = [
             aligned(mi.Float, values.astype(np.float32))
-            for values in (spread.up_x, spread.up_y, *aside, spread.straight_down, spread.straight_up)
+            for values in (spread.up_x, spread.up_y, spread.straight_down, spread.straight_up)
         ]
+
+    def draw(self, point: mi.Point3f, down: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        """Return numbers of targets by uniform numbers, and distances to their middle heights [m].
+
+        `point`, `down`: start of rays [m], and the downward component of their directions.
+        """
+        number = dr.minimum(mi.UInt32(u * self.count), self.count - 1)
+        return number, dr.maximum(point.z - dr.gather(mi.Float, self._heights, number), _BEYOND) / down
+
+    def ways(self, path: mi.UInt32, scale: mi.Float) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+        """Return displacements of ways up [m], and the straight shares of the ways down and up.
+
+        `path`, `scale`: number of the path in the spread, and length of its displacements over those there.
+        """
+        x, y, down, up = (dr.gather(mi.Float, one, path) for one in self._ways)
+        return mi.Vector3f(x, y, 0) * scale, down, up
+
+    def meet(
+        self,
+        solids: mi.Scene | LidarScene,
+        ray: mi.Ray3f,
+        along: mi.Float,
+        up: mi.Vector3f,
+        straight: mi.Float,
+        number: mi.UInt32,
+        active: mi.Bool,
+    ) -> mi.SurfaceInteraction3f:
+        """Return where ways up meet the targets with some numbers first; not valid for others.
+
+        `ray`, `along`: ray of the view, and length of the straight way [m]. `up`, `straight`: as of `ways`.
+        """
+        turn = ray(straight * along)
+        chord = ray(along) + up - turn
+        onward = dr.select(dr.norm(chord) > _BEYOND, dr.normalize(chord), ray.d)
+        first = mi.Ray3f(ray.o, ray.d)
+        first.maxt = straight * along
+        met = solids.ray_intersect(first, active)
+        met = dr.select(met.is_valid(), met, solids.ray_intersect(mi.Ray3f(turn, onward), active & ~met.is_valid()))
+        shape, wanted = dr.reinterpret_array(mi.UInt32, met_shape(met)), mi.UInt32(0)
+        for index, own in enumerate(self._numbers):
+            wanted = dr.select(number == index, own, wanted)
+        met.t = dr.select(met.is_valid() & (shape == wanted), met.t, math.inf)
+        return met
 
     def are_at(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Return whether intersections are on targets."""
@@ -67,56 +105,23 @@ class Targets:
             found = dr.select(passed, further, found)
         return found
 
-    def ways(
+    def let_pass(
         self,
         solids: mi.Scene | LidarScene,
-        ray: mi.Ray3f,
-        along: mi.Float,
-        shift: mi.Vector3f,
-        on_target: mi.Bool,
-        path: mi.UInt32,
-        scale: mi.Float,
+        whole: mi.Vector3f,
+        ways: Sequence[tuple[mi.Point3f, mi.Float, mi.Point3f]],
         active: mi.Bool,
-    ) -> tuple[mi.Vector3f, mi.Vector2f, mi.Bool]:
-        """Return by how much ways are displaced, and which of them pass the targets.
+    ) -> mi.Bool:
+        """Return which paths meet no target on several ways, of which the ends may be on one.
 
-        Parameters
-        ----------
-        solids
-            As of the class.
-        ray, along
-            Ray of the view in the water, and distance of the place on it that light has turned at, or beside it [m].
-        shift
-            Displacement of the straight way down from the ray [m].
-        on_target
-            Where light has turned on a target at the place itself; elsewhere the way up ends beside it.
-        path, scale
-            Number of the path in the spread, and length of its displacements over those there.
-        active
-            Which paths there are.
-
-        Returns
-        -------
-        displacement, angles
-            Displacement of the view from the ray to another one that sees the target's place [m], the opposite of the
-            straight way's, and by how much its angles are less [rad]; the first is 0 if light has not turned on a
-            target.
-        passes
-            Which of the active ways no target blocks.
+        `whole`: displacement along a straight way [m]. `ways`: start [m], straight share, and end [m].
         """
-        up_x, up_y, aside_x, aside_y, *straight = (dr.gather(mi.Float, one, path) for one in self._ways)
-        up = mi.Vector3f(up_x, up_y, 0) * scale
-        moved = dr.select(on_target, up, 0)
         passes = mi.Bool(active)
-        for start, share in zip((ray.o + shift - moved, ray.o - moved), straight, strict=True):
-            turn = start + ray.d * (share * along)
-            for one, other in ((start, turn), (turn, ray(along) + up - moved)):
-                passes &= ~self._block(solids, one, other, passes)
-        return moved, mi.Vector2f(aside_x, aside_y) * scale, passes
-
-    def _block(self, solids: mi.Scene | LidarScene, start: mi.Point3f, end: mi.Point3f, active: mi.Bool) -> mi.Bool:
-        """Return whether a target is between two points [m], of which the second may be on one."""
-        length = dr.norm(end - start)
-        ray = mi.Ray3f(start, (end - start) / dr.maximum(length, _BEYOND))
-        ray.maxt = length - _BEFORE
-        return self.are_at(solids.ray_intersect(ray, active & (length > _BEFORE)))
+        for start, straight, end in ways:
+            turn = start + whole * straight
+            for one, other in ((start, turn), (turn, end)):
+                length = dr.norm(other - one)
+                ray = mi.Ray3f(one, (other - one) / dr.maximum(length, _BEYOND))
+                ray.maxt = length - _BEFORE
+                passes &= ~self.are_at(solids.ray_intersect(ray, passes & (length > _BEFORE)))
+        return passes
