@@ -26,7 +26,7 @@ from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_s
 from mitransient_lidar.rendering.pass_size import describe_cost, fit_to_time
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.passive import render_passive
-from mitransient_lidar.rendering.scene_checks import check_scene, warn_of_shadows
+from mitransient_lidar.rendering.scene_checks import check_scene
 from mitransient_lidar.rendering.shots.frames import render_frames
 from mitransient_lidar.rendering.shots.series import render_shots
 from mitransient_lidar.results.attributes import join, split, uninterrupted
@@ -119,10 +119,10 @@ def render(
         coordinate ``gate_smoothing_bias`` estimates the change by smoothing.
     light
         'merging' (the default), the integrator, or 'maps': the light of the beam is looked up in maps at several depths
-        (`transport.light_maps.renderer`). For images over waves, layers of one index and a bottom; shadows of targets
-        in the beam are left out. 'level', by default 8 passes in about a second, is a first look and a second opinion:
-        such maps below a level sea with all of its slopes as ripples, the mean over seas. Light that turns more than
-        once between down and up is left out, as are the sides of solids.
+        (`transport.light_maps.renderer`). For images over waves, layers of one index, targets and a bottom. 'level', by
+        default 8 passes in about a second, is a first look and a second opinion: such maps below a level sea with all
+        of its slopes as ripples, the mean over seas. Light that turns more than once between down and up is left out,
+        as are the sides of solids.
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here. The previously
         active variant is active again afterwards.
@@ -230,8 +230,6 @@ def _render(
         renderer = renderer.perturbed(changes)
     window = ErrorWindow.of_probe(renderer.probe)
     check_scene(renderer.probe)
-    if by_maps:
-        warn_of_shadows(lidar)
     described = describe_scene(renderer.probe, window, renderer.focusing)
     origins = renderer.classes.names if components else []
     surface = described.get("surface_time_ns")

@@ -13,7 +13,6 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.fitted_axis import NEAREST_RANGE, earliest_ns, total_reflection_ns
-from mitransient_lidar.transport.light_maps.suitability import light_faintly
 from mitransient_lidar.transport.opaque import shape_number
 from mitransient_lidar.transport.probe import PROBE_RAYS, Probe, Rays, SolidEcho, gaps
 from mitransient_lidar.transport.rng import unit_points
@@ -64,18 +63,6 @@ def check_scene(probe: Probe) -> None:
         _warn_of_inside_out(solid)
     for echo in probe.echoes.solids:
         _warn_of_time(probe, echo)
-
-
-def warn_of_shadows(scene: LidarScene) -> None:
-    """Warn about targets whose shadows light maps leave out."""
-    place = scene.receiver.pose.ground_point()[None, :2]
-    lit = [str(target.id()) for target in scene.targets if not light_faintly(scene, target, place, None)[0]]
-    if lit:
-        logger.warning(
-            "light maps leave out the shadows of %s in the beam: targets are a few per cent too dark, and the "
-            "bottom beside them too bright",
-            ", ".join(lit[:_MOST_NAMED]),
-        )
 
 
 def _check_under_water(probe: Probe) -> None:

@@ -1,5 +1,7 @@
 """Frames of gates with own pulses: against renders of moved lidars and later seas, and waves in closed form."""
 
+import itertools
+
 import numpy as np
 import pytest
 from significance import largest_z
@@ -8,6 +10,7 @@ import mitransient_lidar
 from mitransient_lidar.cli.messages import exit_if_interrupted
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.realization import Motion, heights_of, wave_coefficients, wave_numbers
 from mitransient_lidar.physics.sea.wave_spectrum import MatchedSpectrum
@@ -135,6 +138,23 @@ def test_ctrl_c_keeps_the_frames_that_are_complete():
     assert 1 <= frames.sizes["frame"] < 500
     with pytest.raises(KeyboardInterrupt, match=f"interrupted after {frames.sizes['frame']} of 500 frames"):
         exit_if_interrupted(frames)
+
+
+@pytest.mark.slow
+def test_an_interruption_between_passes_keeps_the_frames_before(monkeypatch):
+    """Four passes of a first frame, and the second pass of the next images."""
+    calls = itertools.count(1)
+
+    def check():
+        if next(calls) == 6:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(DeferredInterrupt, "check", staticmethod(check))
+    few = {**PATHS, "paths_per_pass": 2**10}
+    frames = mitransient_lidar.render_frames(
+        "table1", {**GATES, "spectrum": "flat"}, integrator=few, frames=500, passes=4
+    )
+    assert (frames.sizes["frame"], frames.attrs["interrupted"]) == (1, 1)
 
 
 def test_frames_beyond_the_memory_are_refused_before_the_render():

@@ -47,6 +47,12 @@ class TwoWaySpread:
     of_bottom: FloatArray
     of_water: FloatArray
     events: IntArray  #: Number of scattering events without that one.
+    #: Displacement of the way up from the straight one [m], and depths of the first events on the ways down and up over
+    #: the depth, 1 without any.
+    up_x: FloatArray
+    up_y: FloatArray
+    straight_down: FloatArray
+    straight_up: FloatArray
 
     @classmethod
     def of_column(
@@ -70,11 +76,11 @@ class TwoWaySpread:
         found: list[list[FloatArray]] = []
         layers = column.layer_at(depths)
         for number, (layer, q) in enumerate(zip(layers, ways.unscattered, strict=True)):
-            scattered = np.flatnonzero(ways.values[number, -1] > 0)
+            scattered = np.flatnonzero(ways.values[number, 7] > 0)
             mass = ways.share * scattered.size / (_WAYS * paths)
             shares = np.array([q * mass, q * mass, mass**2])
             if shares.sum() <= 0:
-                found.append([np.zeros(paths)] * 6)
+                found.append([np.zeros(paths)] * 8 + [np.ones(paths)] * 2)
                 continue
             # The first part has scattered on the way down alone, the second on the way up, the third on both.
             ends = np.round(np.cumsum(shares) / shares.sum() * count).astype(int)
@@ -82,7 +88,9 @@ class TwoWaySpread:
             slant = 1 / ways.values[number, 6, scattered]
             down, up = (scattered[_drawn(slant, count, rng)] for _ in range(2))
             down[(place >= ends[0]) & (place < ends[1])] = up[place < ends[0]] = -1
-            (x1, y1, e1, a1, *u1, n1), (x2, y2, e2, a2, *u2, n2) = (ways.values[number][:, one] for one in (down, up))
+            (x1, y1, e1, a1, *u1, n1, s1), (x2, y2, e2, a2, *u2, n2, s2) = (
+                ways.values[number][:, one] for one in (down, up)
+            )
             absorbed = np.exp(-(a1 + a2)) * shares.sum() / (1 - q**2)
             # More of the ways that end nearly level, of which few have most of the water's light.
             for one, ends in ((down, u1[2]), (up, u2[2])):
@@ -97,10 +105,11 @@ class TwoWaySpread:
             chosen = np.sum(kept < rng.random((paths, 1)) * kept[:, -1:], axis=1)
             one = np.take_along_axis(groups, chosen[:, None], axis=1)[:, 0]
             moved = [each[one] for each in (x2 - x1, y2 - y1, e1 + e2)]
-            found.append([*moved, *(each[groups].mean(axis=1) for each in (absorbed, of_water)), (n1 + n2)[one]])
+            weights = (each[groups].mean(axis=1) for each in (absorbed, of_water))
+            found.append([*moved, *weights, *(each[one] for each in (n1 + n2, x2, y2, s1, s2))])
         arrays = [np.array(each) for each in zip(*found, strict=True)]
-        x, y, excess, of_bottom, of_water, events = arrays
-        return cls(depths, x, y, excess, of_bottom, of_water, events.astype(np.int64))
+        x, y, excess, of_bottom, of_water, events, *of_ways = arrays
+        return cls(depths, x, y, excess, of_bottom, of_water, events.astype(np.int64), *of_ways)
 
 
 class _Ways:
@@ -108,8 +117,8 @@ class _Ways:
 
     `share`: share of the light that meets an event above the last depth. `unscattered`: share of the light that has met
     none at each depth, shape (depths,). `values`: displacement x, y [m], excess length [m], excess absorption,
-    direction x, y, z and number of events of ways at each depth, shape (depths, 8, ways + 1). The number is 0 for ways
-    that go up before it, and the last way is straight.
+    direction x, y, z, number of events of ways at each depth, and depth of the first over it, shape
+    (depths, 9, ways + 1). The number is 0 for ways that go up before it, and the last way is straight.
     """
 
     def __init__(
@@ -131,16 +140,17 @@ class _Ways:
         self.share = -np.expm1(-whole)
         self.unscattered = np.exp(-np.interp(depths, edges, optical) / cos_water)
         axis = np.array([np.sqrt(1 - cos_water**2), 0.0, cos_water])
-        self.values = np.zeros((depths.size, 8, count + 1))
-        self.values[:, 4:7] = axis[:, None]
+        self.values = np.zeros((depths.size, 9, count + 1))
+        self.values[:, 4:7], self.values[:, 8] = axis[:, None], 1.0
         position, direction = np.zeros((3, count)), np.tile(axis[:, None], (1, count))
-        length, depth_a = np.zeros(count), np.zeros(count)
+        length, depth_a, first = (np.zeros(count) for _ in range(3))
         alive = np.arange(count)
         # Stratified, so that the share of ways that have scattered above each depth has little noise.
         flight = -np.log1p(-self.share * (rng.permutation(count) + rng.random(count)) / count)
         for event in range(_MOST_EVENTS):
             below = np.interp(position[2], edges, optical) + flight * direction[2]
             z = np.where(below < optical[-1], np.interp(below, optical, edges), np.inf)
+            first = first if event else z
             for number in np.flatnonzero(depths >= position[2].min(initial=np.inf)) if event else ():
                 crosses = np.flatnonzero((position[2] < depths[number]) & (z >= depths[number]))
                 step = (depths[number] - position[2][crosses]) / direction[2][crosses]
@@ -153,7 +163,8 @@ class _Ways:
                 total = depth_a[crosses] + above / direction[2][crosses]
                 more = total - np.interp(depths[number], edges, absorbed) / cos_water
                 events = np.full(ways.shape, event)
-                self.values[number][:, ways] = x, y, run - tilt, more, *direction[:, crosses], events
+                straight = first[ways] / depths[number]
+                self.values[number][:, ways] = x, y, run - tilt, more, *direction[:, crosses], events, straight
             goes_on = np.isfinite(z)
             step = (z[goes_on] - position[2][goes_on]) / direction[2][goes_on]
             alive, position, direction = alive[goes_on], position[:, goes_on], direction[:, goes_on]

@@ -33,7 +33,7 @@ from mitransient_lidar.rendering.passes import (
     pass_seed,
     warn_of_edge_loss,
 )
-from mitransient_lidar.rendering.scene_checks import check_scene, warn_of_shadows
+from mitransient_lidar.rendering.scene_checks import check_scene
 from mitransient_lidar.rendering.shots.batches import ShotBatches, ShotPoses
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.results.gate_stack import build_gates
@@ -133,8 +133,6 @@ def render_frames(
     lidar = renderer.scene
     session.tell_axis(lidar.axis, lidar.record_end)
     check_scene(renderer.probe)
-    if by_maps:
-        warn_of_shadows(lidar)
     window = ErrorWindow.of_probe(renderer.probe)
     described = describe_scene(renderer.probe, window, renderer.focusing)
     train = placed_gates(lidar, described.get("surface_time_ns"), float(window.start_ns.min()))
@@ -223,7 +221,9 @@ class _Images:
         try:
             with DeferredInterrupt() as interruption:
                 while self.done < len(self.mean):
-                    rows = np.arange(self.done, min(self.done + self._size, len(self.mean)))
+                    # One frame first, then as many images as there are: an interruption keeps about half of the work.
+                    size = min(max(gates, self.done), self._size)
+                    rows = np.arange(self.done, min(self.done + size, len(self.mean)))
                     found = self._render(rows)
                     self.mean[rows], self.stderr[rows] = found.mean, found.stderr
                     self.done = int(rows[-1]) + 1
@@ -259,4 +259,6 @@ class _Images:
             self.received += float(np.nansum(energy))
             self.lost += received.edge_loss
             found.add(energy[np.arange(rows.size), :, gate])
+            if number + 1 < self._passes:
+                DeferredInterrupt.check()
         return found

@@ -179,7 +179,7 @@ class LightMaps:
     def __init__(self, scene: LidarScene, planes: Planes, shots: int, rays: int) -> None:
         self.count, self._cells = planes.depths.size, planes.cells
         self._units = float(np.clip(_UNITS_PER_RAY * rays, _FEWEST_UNITS, _MOST_UNITS))
-        self._step = opaque(float(planes.depths[1]))
+        self.step = opaque(float(planes.depths[1]))  #: Distance of planes [m].
         self._half, self._absorbed, self._scattered = (
             aligned(mi.Float, each.astype(np.float32)) for each in (planes.half, planes.absorbed, planes.scattered)
         )
@@ -204,11 +204,11 @@ class LightMaps:
 
     def depth_of(self, plane: mi.UInt32) -> mi.Float:
         """Return the depth of planes [m]."""
-        return mi.Float(plane) * self._step
+        return mi.Float(plane) * self.step
 
     def plane_at(self, depth: mi.Float, u: mi.Float) -> mi.UInt32:
         """Return one of the two planes about a depth [m], in proportion to the distances, by uniform numbers."""
-        return dr.minimum(mi.UInt32(dr.maximum(depth / self._step, 0) + u), self.count - 1)
+        return dr.minimum(mi.UInt32(dr.maximum(depth / self.step, 0) + u), self.count - 1)
 
     def _cell(
         self, lanes: Lanes, plane: mi.UInt32, place: mi.Point3f, depth: mi.Float
@@ -237,6 +237,7 @@ class LightMaps:
         depths: tuple[mi.Float, mi.Float],
         length: mi.Float,
         active: mi.Bool,
+        lit: mi.Bool | None = None,
     ) -> None:
         """Add rays of the beam to planes.
 
@@ -252,6 +253,8 @@ class LightMaps:
             Relative optical lengths up to there [m].
         active
             Which rays there are.
+        lit
+            Which rays no target has met up to there, by default all.
         """
         cell, inside, level = self._cell(lanes, plane, place, self.depth_of(plane))
         own = (dr.gather(mi.Float, each, plane) for each in (self._absorbed, self._scattered))
@@ -260,6 +263,7 @@ class LightMaps:
         clear = kept * dr.exp(scattered)
         active &= inside
         dr.scatter_add(self._energy, mi.UInt32(kept * self._units), cell, active)
+        active = active if lit is None else active & lit
         dr.scatter_add(self._clear, mi.UInt32(clear * self._units), cell, active)
         dr.scatter_add(self._length, mi.Int32(clear * (length - level) * (_LENGTH_UNITS * self._units)), cell, active)
 
@@ -272,7 +276,7 @@ class LightMaps:
         -------
         energy
             Energy through a horizontal area over that emitted [1/m^2]: of light that no event has turned, or with
-            `scattered` as if none turned it.
+            `scattered` as if none turned it and no target were there.
         length
             Mean relative optical length of unscattered light [m].
         """
@@ -284,7 +288,7 @@ class LightMaps:
         energy = mi.Float(dr.gather(mi.UInt32, self._energy, cell, inside)) if scattered else clear
         density = (0.5 * self._cells) ** 2 / self._units / dr.square(dr.gather(mi.Float, self._half, plane))
         # Optical depths of the axis at the depth itself, above the mean sea level continued.
-        at = dr.minimum(depth / self._step, self.count - 1)
+        at = dr.minimum(depth / self.step, self.count - 1)
         low = dr.minimum(mi.UInt32(dr.maximum(at, 0)), self.count - 2)
 
         def between(values: mi.Float) -> mi.Float:

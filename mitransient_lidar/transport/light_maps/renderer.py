@@ -22,6 +22,7 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.two_way_spread import TwoWaySpread
 from mitransient_lidar.transport.light_maps.maps import FEWEST_CELLS, HeightFields, LightMaps, Planes
+from mitransient_lidar.transport.light_maps.shadows import Targets
 from mitransient_lidar.transport.light_maps.suitability import REACH_THE_SURFACE, UnsuitedError, unsuited
 from mitransient_lidar.transport.medium.water_phases import table_of
 from mitransient_lidar.transport.opaque import aligned, changed, opaque, opaque_index
@@ -35,7 +36,7 @@ from mitransient_lidar.transport.sensor.receiver import SensorSample
 from mitransient_lidar.transport.solids import met_shape
 
 #: Numbers of the random sequences within a pass.
-_BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS = range(5)
+_BEAM, _VIEW, _WATER, _BOTTOM, _GLINTS, _BEHIND, _TARGETS = range(7)
 
 #: Planes of maps below the mean sea level, and paths of scattered light at each depth.
 _PLANES, _PATHS = 16, 2**12
@@ -61,7 +62,7 @@ _RAYS_PER_PIXEL, _FEWEST_RAYS, _MOST_RAYS = 16, 2**15, 2**21
 _CELLS_PER_WAVE, _MOST_CELLS, _BEAM_PER_CELL = 2.5, 480, 4
 
 #: Memory of a cell of the maps, and of a ray of the beam and the view [bytes].
-_BYTES_PER_CELL, _BYTES_PER_BEAM, _BYTES_PER_RAY = 12, 60, 120
+_BYTES_PER_CELL, _BYTES_PER_BEAM, _BYTES_PER_RAY = 12, 60, 128
 
 #: Distance beyond all waves that focus light [m].
 _FAR = 1e3
@@ -122,12 +123,15 @@ class _Seen:
     solid: mi.UInt32
     slope: mi.Vector2f  #: Slopes of the bottom along x and y, 0 on steep sides.
     turned: mi.Float  #: Reflected radiance over the energy through a horizontal area [1/sr].
+    #: Distance to the first target and, behind targets, to the bottom [m].
+    to_target: mi.Float
+    to_bottom: mi.Float
 
 
 class LightMapRenderer(PassRenderer):
     """Renders passes over waves, water of one refractive index and a bottom; see `unsuited`.
 
-    Paths that change more than once between down and up are left out, and the shadows of solids in the beam.
+    Paths that change more than once between down and up are left out. Of `image` and `level`, targets have shadows.
 
     `level`: whether the sea is level, with all of its slopes as ripples, as the mean over seas, enhanced by the
     focusing of all waves (`physics.sea.double_passage`). `image`: whether a pass is one of few for a render, instead of
@@ -165,6 +169,10 @@ class LightMapRenderer(PassRenderer):
         self._sea = HeightFields.about(scene, level=level)
         self._kept: tuple[Any, LightMaps] | None = None
         self._solids = scene.solids_alone
+        # Ripples rise and fall by half their height at most, however steep they are.
+        heights = [height for solid in scene.bottoms for height in (solid.bbox().min.z, solid.bbox().max.z)]
+        self._relief = opaque(0.5 * (max(heights, default=0) - min(heights, default=0)))
+        self._targets = Targets(scene, spread) if (image or level) and scene.targets else None
 
     @property
     def path_count(self) -> int:
@@ -175,9 +183,10 @@ class LightMapRenderer(PassRenderer):
     def memory(self) -> tuple[float, float]:
         """Memory of maps, and of rays for each received pixel [bytes]."""
         beams, of_maps = self.paths * self._sampling.beam, self._planes.depths.size * self._planes.cells**2
+        of_ray = _BYTES_PER_RAY * (1 if self._targets is None else 2)
         return (
             _BYTES_PER_CELL * of_maps + _BYTES_PER_BEAM * beams,
-            _BYTES_PER_RAY * self.paths / self.scene.receiver.pixels.count,
+            of_ray * self.paths / self.scene.receiver.pixels.count,
         )
 
     @property
@@ -196,9 +205,12 @@ class LightMapRenderer(PassRenderer):
         lanes, sample = self._sample(received, shots, paths, _VIEW)
         if dr.width(lanes.number) == 0:
             return
-        seen = self._view(shots, lanes, sample)
+        seen, *behind = self._view(shots, lanes, sample)
         for origin in (_WATER, _BOTTOM) if self.scene.solids else (_WATER,):
             self._return(received, shots, paths, maps, seen, lanes, origin)
+        for one in behind:
+            self._return(received, shots, paths, maps, one, lanes, _BEHIND)
+            self._return(received, shots, paths, maps, seen, lanes, _TARGETS)
 
     def _sample(self, received: ReceivedLight, shots: Shots, count: int, purpose: int) -> tuple[Lanes, SensorSample]:
         """Return `count` rays of the view, or those of the tile's pixels."""
@@ -247,12 +259,17 @@ class LightMapRenderer(PassRenderer):
         si, length = self._meet_sea(moved, lanes, moved.transmitter_pose, angles, mi.Bool(True))
         share = dr.full(mi.Float, 1 / count, dr.width(lanes.number))
         rays = self._enter(si, length, share, mi.TransportMode.Importance, ripple)
-        dr.eval(rays)
+        lit = mi.Float(math.inf)
+        if self._targets is not None:
+            ray = mi.Ray3f(rays.point, rays.direction)
+            lit = self._targets.distance(self._solids_of(moved).ray_intersect(ray, rays.active))
+        dr.eval(rays, lit)
         maps = LightMaps(scene, self._planes, shots.count, count)
         # Plane after plane, so that the lanes of a packet add to one map. Planes above troughs serve places below them.
         own, of_map = shots.paths(count * maps.count), opaque_index(count)
         plane = own.number // of_map
-        rays = dr.gather(_Rays, rays, own.shot * of_map + own.number - plane * of_map)
+        ray_of = own.shot * of_map + own.number - plane * of_map
+        rays = dr.gather(_Rays, rays, ray_of)
         distance = (-maps.depth_of(plane) - rays.point.z) / rays.direction.z
         start, down = -rays.point.z, -rays.direction.z
         absorbed, scattered = (
@@ -260,8 +277,13 @@ class LightMapRenderer(PassRenderer):
         )
         length = rays.length + opaque(scene.group_index) * distance
         place = rays.point + rays.direction * distance
-        maps.add(own, plane, place, rays.weight, (absorbed, scattered), length, rays.active)
+        is_lit = None if self._targets is None else distance < dr.gather(mi.Float, lit, ray_of)
+        maps.add(own, plane, place, rays.weight, (absorbed, scattered), length, rays.active, is_lit)
         return maps
+
+    def _solids_of(self, moved: LidarScene) -> mi.Scene | LidarScene:
+        """Return what rays under water meet: shots have the solids as parts of their own."""
+        return moved if moved.parts or self._solids is None else self._solids
 
     def _reflect(self, received: ReceivedLight, shots: Shots, count: int) -> None:
         """Add the light that the sea reflects to rays of the view."""
@@ -275,21 +297,41 @@ class LightMapRenderer(PassRenderer):
         energy, none = glint * line.irradiance * sample.weight, mi.UInt32(0)
         received.receive(sample.pixel, none, mi.UInt32(1), none, length + line.length, energy, seen & (energy > 0))
 
-    def _view(self, shots: Shots, lanes: Lanes, sample: SensorSample) -> _Seen:
-        """Return rays of the view in the water, and what they meet."""
+    def _view(self, shots: Shots, lanes: Lanes, sample: SensorSample) -> list[_Seen]:
+        """Return rays of the view in the water, and what they meet; if there are targets, again with what is behind."""
         moved = lanes.pick(self.scene)
         si, length = self._meet_sea(moved, lanes, moved.receiver_pose, sample.angles, sample.weight > 0)
         ripple = _spaced(shots, lanes, _VIEW, 3)
         rays = self._enter(si, length, sample.weight, mi.TransportMode.Radiance, ripple)
         by_surface = length + moved.relative(moved.transmitter_pose).distance(si.p)
-        # Shots have the solids as parts of their own.
-        solids = moved if moved.parts or self._solids is None else self._solids
-        bed = solids.ray_intersect(mi.Ray3f(si.p, rays.direction), rays.active & (self._solids is not None))
+        solids, ray = self._solids_of(moved), mi.Ray3f(si.p, rays.direction)
+        bed = solids.ray_intersect(ray, rays.active & (self._solids is not None))
+        if self._targets is None:
+            none = mi.Float(math.inf)
+            found = [self._seen(moved, rays, sample, by_surface, bed, none, bed.t)]
+        else:
+            to_target, bottom = self._targets.distance(bed), self._targets.behind(solids, ray, bed)
+            found = [self._seen(moved, rays, sample, by_surface, one, to_target, bottom.t) for one in (bed, bottom)]
+            found[1].rays = replace(rays, active=rays.active & (to_target < math.inf))
+        dr.eval(found)
+        return found
+
+    def _seen(
+        self,
+        moved: LidarScene,
+        rays: _Rays,
+        sample: SensorSample,
+        by_surface: mi.Float,
+        bed: mi.SurfaceInteraction3f,
+        to_target: mi.Float,
+        to_bottom: mi.Float,
+    ) -> _Seen:
+        """Return rays of the view that meet solids."""
         on_bed = rays.active & bed.is_valid()
         # Light comes down along the ray: the bottom turns what passes a horizontal area by its cosine over this one's.
         value = bed.bsdf().eval(mi.BSDFContext(), moved.on_shapes(bed), bed.wi, on_bed)[0]
         slope = mi.Vector2f(-bed.n.x / bed.n.z, -bed.n.y / bed.n.z)
-        seen = _Seen(
+        return _Seen(
             rays,
             mi.UInt32(sample.pixel),
             by_surface,
@@ -298,9 +340,9 @@ class LightMapRenderer(PassRenderer):
             self.classes.solid(met_shape(bed)),
             dr.select(dr.norm(slope) <= _STEEPEST, slope, 0),
             dr.select(on_bed, value / -rays.direction.z, 0),
+            to_target,
+            dr.select(rays.active & (to_bottom < math.inf), to_bottom, _NO_BED),
         )
-        dr.eval(seen)
-        return seen
 
     def _return(
         self,
@@ -312,8 +354,12 @@ class LightMapRenderer(PassRenderer):
         own: Lanes,
         origin: int,
     ) -> None:
-        """Add the light that returns from the water, or from the bottom, to rays of the view, `own` of the `count`."""
-        scene, water, from_bed = self.scene, self.scene.required_water, origin == _BOTTOM
+        """Add the light that returns from the water or the bottom to rays of the view, `own` of the `count`.
+
+        From a bottom behind targets, and from targets, comes scattered light alone. A target meets the ways up to a
+        depth of its own, so that its light arrives in all pixels.
+        """
+        scene, water, from_bed, targets = self.scene, self.scene.required_water, origin != _WATER, self._targets
         per_ray, each = (
             self._sampling.at_bottom if from_bed else self._sampling.depths,
             dr.width(own.number) // shots.count,
@@ -331,21 +377,46 @@ class LightMapRenderer(PassRenderer):
         rays, thickness = seen.rays, opaque(float(self._planes.depths[-1]) / self._sampling.depths)
         # Before all light is received: a new number in memory ends the kernel.
         down, group_index = -rays.direction.z, opaque(scene.group_index)
-        if from_bed:
-            along, place, path = seen.to_bed, seen.bed, (mi.Float(part) + path) / per_ray
-            active, turned = rays.active & (along < _NO_BED), seen.turned
+        line, part_of = mi.Ray3f(rays.point, rays.direction), (mi.Float(part) + path) / per_ray
+        if origin == _TARGETS and targets is not None:
+            active, path, target, along = rays.active, part_of, *targets.draw(rays.point, down, u)
+        elif from_bed:
+            along, place, path = seen.to_bed, seen.bed, part_of
+            active, turned, solid = rays.active & (along < _NO_BED), seen.turned, seen.solid
         else:
             along = thickness * (mi.Float(part) + u) / down
-            place = rays.point + rays.direction * along
-            active, layer = rays.active & (along < seen.to_bed), water.scattering_flight.layer_at(-place.z)
-            turned = dr.gather(mi.Float, self._turned, layer) * thickness / dr.square(down)
+            place = line(along)
+            active, layer = rays.active & (along < seen.to_bottom), water.scattering_flight.layer_at(-place.z)
+            turned, solid = dr.gather(mi.Float, self._turned, layer) * thickness / dr.square(down), mi.UInt32(0)
+        # Scattering, from the next plane's paths.
+        plane = dr.maximum(maps.plane_at(along * down, pick), 1)
+        entry = (plane - 1) * _PATHS + dr.minimum(mi.UInt32(path * _PATHS), _PATHS - 1)
+        scale = along * down / maps.depth_of(plane)
+        x, y, excess, of_bed, of_water = (dr.gather(mi.Float, one, entry) for one in self._spread)
+        shift, excess, above, passes = mi.Vector3f(x, y, 0) * scale, excess * scale, pick, active
+        if targets is not None:
+            moved = lanes.pick(scene)
+            solids, (up, of_down, of_up) = self._solids_of(moved), targets.ways(entry, scale)
+            if origin == _TARGETS:
+                met = targets.meet(solids, line, along, up, of_up, target, active)
+                place, active, solid = met.p, active & met.is_valid(), self.classes.solid(met_shape(met))
+                value = met.bsdf().eval(mi.BSDFContext(), moved.on_shapes(met), met.to_local(-line.d), active)[0]
+                turned, along, shift = targets.count * value / down, (line.o.z - place.z) / down, shift - up
+                ends, passes = [(place - line.d * along + shift, of_down, place)], active
+            else:
+                # The plane below a target is in its shadow.
+                above = dr.select(along + maps.step / down > seen.to_target, 0, pick)
+                end = place + up
+                ends = [(line.o, of_up, end), (line.o + shift, of_down, end)]
+                passes = active & ~(from_bed & (along == seen.to_target))
+            passes = targets.let_pass(solids, line.d * along, ends, passes)
         absorbed, scattered = (
             flight.optical_depth(-rays.point.z, down, along)
             for flight in (water.absorption_flight, water.scattering_flight)
         )
         kept = opaque(scene.transmitter.energy) * rays.weight * dr.exp(-absorbed) * turned
         length, depth = rays.length + group_index * along, -place.z
-        turns, solid = mi.UInt32(0 if from_bed else 1), seen.solid if from_bed else mi.UInt32(0)
+        turns = mi.UInt32(0 if from_bed else 1)
 
         def receive(events: mi.UInt32, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
             echo = Echo(seen.surface_length, from_bed)
@@ -354,22 +425,19 @@ class LightMapRenderer(PassRenderer):
             )
 
         # Light without scattering, at the bottom once for each ray.
-        lit, way = maps.look_up(lanes, place, depth, pick, scattered=False)
-        once = active & (part == 0) if from_bed else active
-        receive(mi.UInt32(0), length + way, kept * dr.exp(-scattered) * lit, once)
-        # Light that has scattered on one of the ways or both, along a path from the next plane.
-        plane = dr.maximum(maps.plane_at(along * down, pick), 1)
-        entry = (plane - 1) * _PATHS + dr.minimum(mi.UInt32(path * _PATHS), _PATHS - 1)
-        scale = along * down / maps.depth_of(plane)
-        x, y, excess, of_bed, of_water = (dr.gather(mi.Float, one, entry) for one in self._spread)
-        x, y, excess = x * scale, y * scale, excess * scale
-        lit, way = maps.look_up(lanes, mi.Point3f(place.x + x, place.y + y, place.z), depth, pick, scattered=True)
+        if origin in (_WATER, _BOTTOM):
+            lit, way = maps.look_up(lanes, place, depth, above, scattered=False)
+            once = active & (part == 0) if from_bed else active & (along < seen.to_bed)
+            receive(mi.UInt32(0), length + way, kept * dr.exp(-scattered) * lit, once)
+        # Light that has scattered on one of the ways or both.
+        lit, way = maps.look_up(lanes, place + shift, depth, pick, scattered=True)
         share = (1 - dr.exp(-2 * scattered)) * (of_bed / per_ray if from_bed else of_water)
-        if from_bed:
+        if origin in (_BOTTOM, _BEHIND):
             # Half of the displacement lies on the way up.
-            excess -= (seen.slope.x * x + seen.slope.y * y) / down
+            lower = -seen.slope.x * shift.x - seen.slope.y * shift.y
+            excess += dr.clip(lower, -self._relief, self._relief) / down
         energy = kept * share * lit
-        receive(dr.gather(mi.UInt32, self._events, entry), length + way + group_index * excess, energy, active)
+        receive(dr.gather(mi.UInt32, self._events, entry), length + way + group_index * excess, energy, passes)
 
 
 def _spread_of(
