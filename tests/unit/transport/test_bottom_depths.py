@@ -1,5 +1,7 @@
 """Depth of the bottoms of a scene, and waves that follow it in rendered scenes."""
 
+import math
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -67,3 +69,12 @@ def test_waves_know_the_bottom_only_where_it_limits_them():
     assert 4 * np.std(vertices(sea)[:, 2]) < 0.3
     assert sea.used_values["shoaling"] == "bottom"
     assert float(scene.bbox().min.z) == pytest.approx(-0.5)
+
+
+def test_no_ray_passes_between_the_faces_of_a_bottom():
+    """Of these places 55 lie on edges that single rays miss."""
+    slope = math.radians(5.0)
+    scene, _ = sea_over({"bottom": {"type": "seabed", "depth": 5.0, "slope_x_deg": 5.0, "size": 80.0}})
+    lines = 0.02 * np.arange(-700, 700)
+    expected = np.broadcast_to(5.0 - math.tan(slope) * lines, (lines.size,) * 2)
+    np.testing.assert_allclose(bottom_depths(scene).sample(lines, lines), expected, atol=1e-3)
