@@ -38,6 +38,9 @@ from mitransient_lidar.core.files import open_log
 
 _LOG = logging.getLogger(__name__)
 
+#: Program of a process. xarray would import Dask for its first dataset, which takes 1.6 s.
+_PROGRAM = "import sys; sys.modules['dask'] = None; from mitransient_lidar.campaigns.shard import main; main()"
+
 _INTERVAL_S = 60.0  #: Time between two writes of a shard that is not finished [s].
 
 #: Number of times that the process may end while it renders a run before this run has failed, or before its first run.
@@ -179,7 +182,7 @@ def _one_process(order: dict[str, Any], report: Report | None, processes: Proces
     environment = {**os.environ, **dict.fromkeys(_THREADS, "1")}
     # Its own session: Ctrl-C is for the process that has started it.
     with subprocess.Popen(
-        [sys.executable, "-m", "mitransient_lidar.campaigns.shard"],
+        [sys.executable, "-c", _PROGRAM],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -342,7 +345,7 @@ def _arrays(
         raise
 
 
-def _main() -> None:
+def main() -> None:
     """Render the shard that standard input names."""
     ended = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ended.set())
@@ -377,7 +380,3 @@ def _end_with_parent() -> None:
     """End this process when its standard input does."""
     sys.stdin.read()
     os._exit(1)
-
-
-if __name__ == "__main__":
-    _main()

@@ -141,7 +141,9 @@ def met_numbers(si: mi.SurfaceInteraction3f) -> NDArray[np.uint32]:
 #: Smallest bottom side over the largest solid's side: waves do not follow targets and piers.
 _BOTTOM_PER_LARGEST = 0.25
 
-_MARGIN = 1e-3  #: Distance of locations from the bottoms' edges, and of ray starts above them [m].
+#: Distance of locations from the bottoms' edges, and of ray starts above them [m]; places of second rays beside the
+#: first one [m].
+_MARGIN, _ASIDE = 1e-3, ((7e-4, 4e-4), (-5e-4, 8e-4))
 
 
 def bottom_depths(scene: mi.Scene) -> BottomDepths | None:
@@ -165,21 +167,31 @@ def bottom_depths(scene: mi.Scene) -> BottomDepths | None:
     alone = cache(partial(scene_of_shapes, tuple(found), ()))
 
     def depths(x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return depths [m] on grid lines [m], shape (len(y), len(x)): of the nearest place in the box, or `DEEP`."""
+        """Return depths [m] on grid lines [m], shape (len(y), len(x)): of the nearest place in the box, or `DEEP`.
+
+        Lines of several patches, shapes (n, len(x)) and (n, len(y)), give theirs, shape (n, len(y), len(x)).
+        """
+        shape = (*y.shape, x.shape[-1])
         if lowest[2] == highest[2]:
-            return np.full((len(y), len(x)), -lowest[2])
-        lines = (
+            return np.full(shape, -lowest[2])
+        along_x, along_y = (
             np.clip(values, low + _MARGIN, high - _MARGIN)
             for values, low, high in zip((x, y), lowest, highest, strict=False)
         )
-        east, north = (values.ravel() for values in np.meshgrid(*lines))
+        east, north = (
+            np.broadcast_to(values, shape).ravel() for values in (along_x[..., None, :], along_y[..., :, None])
+        )
         top = float(highest[2]) + _MARGIN
         origins = np.stack([east, north, np.full(east.size, top)], axis=1)
         down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
-        rays = aligned_ray(origins, down, np.full(east.size, np.inf))
-        met = alone().ray_intersect_preliminary(rays, coherent=True)
-        distance = np.array(met.t, dtype=np.float64)
+        distance = np.full(east.size, np.inf)
+        for aside in ((0.0, 0.0), *_ASIDE):
+            # A few rays on edges of faces pass between them.
+            if not (missed := np.flatnonzero(np.isinf(distance))).size:
+                break
+            rays = aligned_ray(origins[missed] + [*aside, 0.0], down[missed], np.full(missed.size, np.inf))
+            distance[missed] = np.array(alone().ray_intersect_preliminary(rays, coherent=True).t)
         depth = np.where(np.isfinite(distance), distance - top, DEEP)
-        return np.asarray(depth.reshape(len(y), len(x)))
+        return np.asarray(depth.reshape(shape))
 
     return BottomDepths(-float(highest[2]), depths)

@@ -4,12 +4,11 @@ import numpy as np
 
 from mitransient_lidar.physics.sea.realization import (
     Motion,
-    facet_slope_variance,
     heights_of,
     wave_coefficients,
     wave_numbers,
 )
-from mitransient_lidar.physics.sea.wave_spectrum import SeaState
+from mitransient_lidar.physics.sea.wave_spectrum import SeaState, facet_slope_variance
 from mitransient_lidar.physics.sea.wind_spectra import SwellSpectrum
 
 

@@ -205,14 +205,12 @@ class BlurredPulse:
 
     def plain(self, time_ns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return shape and integral of the template at times [ns]."""
-        at = self.start_ns + self.step_ns * np.arange(self.power.shape[1])
-        power = np.interp(time_ns, at, self.power[0], left=0, right=0)
-        return power, np.interp(time_ns, at + 0.5 * self.step_ns, self.integral[0], left=0)
+        place = (time_ns - self.start_ns) / self.step_ns
+        return _between(self.power[0], place), _between(self.integral[0], place - 0.5)
 
     def plain_slope(self, time_ns: FloatArray) -> FloatArray:
         """Return the derivative of the template at times [1/ns]."""
-        at = self.start_ns + self.step_ns * np.arange(self.power.shape[1])
-        return np.asarray(np.interp(time_ns, at, self.slope[0], left=0, right=0))
+        return _between(self.slope[0], (time_ns - self.start_ns) / self.step_ns)
 
     def blurred(self, time_ns: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return shape, its derivative by time [1/ns] and by the variance [1/ns^2], at variances, shape (n, 1)."""
@@ -231,3 +229,11 @@ class BlurredPulse:
         power, slope = (np.where(inside, a + between * (b - a), 0.0) for a, b in zip(near, far, strict=True))
         by_variance = np.where(inside, (far[0] - near[0]) / (self.variances[row + 1] - self.variances[row]), 0.0)
         return power, slope, by_variance
+
+
+def _between(values: FloatArray, place: FloatArray) -> FloatArray:
+    """Return values, which are constant at their ends, at places in steps, linear between them."""
+    place = np.clip(place, 0, values.size - 1.001)
+    left = place.astype(np.intp)
+    first = values[left]
+    return np.asarray(first + (place - left) * (values[left + 1] - first))

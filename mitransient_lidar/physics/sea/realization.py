@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -18,7 +19,7 @@ from mitransient_lidar.physics.sea.wave_spectrum import (
     CosineSpectrum,
     SeaState,
     WaveSpectrum,
-    variances_along,
+    facet_slope_variance,
 )
 
 #: Largest number of cells per grid side, and number of cells in the long-wave grids of a finer sea.
@@ -138,29 +139,6 @@ def heights_of(coefficients: npt.NDArray[np.complex128], cells: int = 0) -> Floa
     return np.asarray(np.fft.fftshift(heights), dtype=np.float64)
 
 
-def facet_slope_variance(
-    variance: FloatArray, ix: IntArray, iy: IntArray, period: float, cells: float, axis: float
-) -> tuple[float, float]:
-    """Return the slope variances [1] along and across an axis for the facets that sample waves.
-
-    `variance`: elevation variances [m^2] of the waves, shape (len(iy), len(ix)); overwritten. `ix`, `iy`: their numbers
-    of wavelengths along x and y over the period, from `wave_numbers`. `period`, `cells`: period [m], and its length in
-    cells, which may be broken. `axis`: direction [rad], counter-clockwise from +x.
-
-    Facet slopes are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d, d the cell side.
-    Their covariance is for cells split along the diagonal from (i+1, j) to (i, j+1), averaged over both triangles in a
-    cell. It is 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds oblique to the
-    mesh.
-    """
-    variance[:, 1:] *= 2  # for the half plane kx < 0
-    # sin(a) sin(b) cos(a - b) = sin(2a) sin(2b)/4 + sin(a)^2 sin(b)^2
-    a, b = ix * np.pi / cells, iy * np.pi / cells
-    square_a, square_b = np.sin(a) ** 2, np.sin(b) ** 2
-    x, y = variance.sum(axis=0) @ square_a, variance.sum(axis=1) @ square_b
-    xy = np.sin(2 * b) @ variance @ np.sin(2 * a) / 4 + square_b @ variance @ square_a
-    return variances_along(np.array([[x, xy], [xy, y]]) * (2 * cells / period) ** 2, axis)
-
-
 def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
     """Return numbers of wavelengths over a period along x and y, and their unit.
 
@@ -210,10 +188,13 @@ class HeightGrid:
     cell_size: float  #: Grid spacing [m].
 
     def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return elevations [m] at the grid points nearest to the grid lines x and y [m], shape (len(y), len(x))."""
+        """Return elevations [m] at the grid points nearest to the grid lines x and y [m], shape (len(y), len(x)).
+
+        Lines of several patches, shapes (n, len(x)) and (n, len(y)), give theirs, shape (n, len(y), len(x)).
+        """
         count = len(self.heights)
         i, j = ((np.rint(np.asarray(lines) / self.cell_size).astype(int) + count // 2) % count for lines in (x, y))
-        return np.asarray(self.heights[np.ix_(j, i)])
+        return np.asarray(self.heights[j[..., :, None], i[..., None, :]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +218,7 @@ class Band:
         if self.reach <= _FEW_WAVES:
             return self._direct(x, y, np.ones(2 * self.reach + 1))
         grid = Interpolation.of_waves(self.reach, self.period, x, y)
-        return grid.between(self._grid[np.ix_(grid.rows, grid.columns)])
+        return grid.between(self._grid[grid.rows[..., :, None], grid.columns[..., None, :]])
 
     def at_points(self, grid: Interpolation) -> FloatArray:
         """Return what to interpolate between the points of an interpolation of these waves or shorter ones [m]."""
@@ -247,9 +228,9 @@ class Band:
     def _direct(self, x: FloatArray, y: FloatArray, share: FloatArray) -> FloatArray:
         """Return the sum of waves with shares by their number of wavelengths along either axis, shape (2 h + 1,)."""
         unit = 2j * np.pi / self.period
-        along_x = share[self.reach :, None] * np.exp(unit * np.outer(np.arange(self.reach + 1), x))
-        along_x[1:] *= 2  # for the half plane kx < 0
-        along_y = share * np.exp(unit * np.outer(y, np.arange(-self.reach, self.reach + 1)))
+        along_x = share[self.reach :, None] * np.exp(unit * (np.arange(self.reach + 1)[:, None] * x[..., None, :]))
+        along_x[..., 1:, :] *= 2  # for the half plane kx < 0
+        along_y = share * np.exp(unit * (y[..., :, None] * np.arange(-self.reach, self.reach + 1)))
         amplitudes = along_y @ self.coefficients
         return np.asarray(amplitudes.real @ along_x.real - amplitudes.imag @ along_x.imag)
 
@@ -268,39 +249,59 @@ class Band:
 
 @dataclass(frozen=True)
 class Interpolation:
-    """Interpolation of waves from a periodic grid, in single precision.
+    """Interpolation between the points of a grid, in single precision.
 
-    A non-uniform Fourier transform of type 2 with the kernel exp(b ((1 - z^2)^(1/2) - 1)) (Barnett, Magland and af
-    Klinteberg 2019, SIAM J. Sci. Comput. 41, C479). Waves are divided by the transform of the kernel.
+    For waves on a periodic grid it is a non-uniform Fourier transform of type 2 with the kernel
+    exp(b ((1 - z^2)^(1/2) - 1)) (Barnett, Magland and af Klinteberg 2019, SIAM J. Sci. Comput. 41, C479). Waves are
+    divided by the transform of the kernel. On other grids it is the cubic convolution of third order (Keys 1981, IEEE
+    Trans. Acoust. Speech Signal Process. 29, 1153).
     """
 
     cells: int  #: Grid points per period.
-    #: Points of the grid along y and x, counted from 0 within the period.
+    #: Numbers of the points along y and x, counted from 0 within the period, shapes (..., points).
     rows: IntArray
     columns: IntArray
-    #: Weights of the points on each line along y and x, shapes (lines, points).
+    #: Weights of the points on each line along y and x, shapes (..., lines, points).
     along_y: npt.NDArray[np.float32]
     along_x: npt.NDArray[np.float32]
 
     @classmethod
     def of_waves(cls, reach: int, period: float, x: FloatArray, y: FloatArray) -> Self:
         """Return the interpolation to grid lines x and y [m] for at most so many wavelengths per period [m]."""
-        cells, found = _cells_of(reach), []
-        for lines in (y, x):
-            place = np.asarray(lines) * (cells / period)
-            first = np.ceil(place - 0.5 * _TAPS).astype(np.int64)
-            points, low = first[:, None] + np.arange(_TAPS), first.min()
-            used = np.arange(min(int(first.max() - low) + _TAPS, cells))
-            weights = np.zeros((len(place), used.size), dtype=np.float32)
-            values = _kernel((points - place[:, None]) / (0.5 * _TAPS))
-            np.put_along_axis(weights, (points - low) % cells, values.astype(np.float32), axis=1)
-            found.append(((used + low) % cells, weights))
-        (rows, along_y), (columns, along_x) = found
-        return cls(cells, rows, columns, along_y, along_x)
+        cells = _cells_of(reach)
+        (rows, along_y), (columns, along_x) = (
+            _weights(np.asarray(lines) * (cells / period), _TAPS, lambda z: _kernel(z / (0.5 * _TAPS)), cells)
+            for lines in (y, x)
+        )
+        return cls(cells, rows % cells, columns % cells, along_y, along_x)
+
+    @classmethod
+    def of_lattice(cls, step: float, x: FloatArray, y: FloatArray) -> Self:
+        """Return the interpolation to grid lines x and y [m] between multiples of a step [m], whose period is one."""
+        (rows, along_y), (columns, along_x) = (_weights(np.asarray(lines) / step, 4, _cubic, 0) for lines in (y, x))
+        return cls(1, rows, columns, along_y, along_x)
 
     def between(self, values: npt.NDArray[np.floating[Any]]) -> FloatArray:
-        """Return heights [m] on the lines, from `Band.at_points`, shape (len(rows), len(columns))."""
-        return np.asarray(self.along_y @ values.astype(np.float32, copy=False) @ self.along_x.T, dtype=np.float64)
+        """Return values on the lines, shape (..., lines, lines), from those at the points, as by `Band.at_points`."""
+        along_x = np.swapaxes(self.along_x, -1, -2)
+        return np.asarray(self.along_y @ values.astype(np.float32, copy=False) @ along_x, dtype=np.float64)
+
+
+def _weights(
+    place: FloatArray, taps: int, kernel: Callable[[FloatArray], FloatArray], cells: int
+) -> tuple[IntArray, npt.NDArray[np.float32]]:
+    """Return numbers of grid points and their weights on lines at places in cells, for a kernel over so many points.
+
+    The grid has a period of `cells`, or none (0).
+    """
+    first = np.ceil(place - 0.5 * taps).astype(np.int64)
+    points, low = first[..., None] + np.arange(taps), first.min(axis=-1, keepdims=True)
+    most = int(np.max(first - low)) + taps
+    used = np.arange(min(most, cells) if cells else most)
+    weights = np.zeros((*place.shape, used.size), dtype=np.float32)
+    values = kernel(points - place[..., None]).astype(np.float32)
+    np.put_along_axis(weights, (points - low[..., None]) % (cells or most), values, axis=-1)
+    return low + used, weights
 
 
 def _cells_of(reach: int) -> int:
@@ -314,6 +315,12 @@ def _shares(reach: int, cells: int) -> FloatArray:
     z, weight = np.polynomial.legendre.leggauss(8 * _TAPS)
     waves = np.cos(np.pi * _TAPS / cells * np.outer(np.arange(-reach, reach + 1), z))
     return np.asarray(2 / _TAPS / (waves @ (weight * _kernel(z))))
+
+
+def _cubic(z: FloatArray) -> FloatArray:
+    """Return the kernel of cubic convolution at distances in cells."""
+    z = np.abs(z)
+    return np.where(z < 1, (1.5 * z - 2.5) * z * z + 1, np.where(z < 2, ((2.5 - 0.5 * z) * z - 4) * z + 2, 0.0))
 
 
 def _kernel(z: FloatArray) -> FloatArray:

@@ -66,7 +66,7 @@ def joined(meshes: Sequence[SeaMesh]) -> SeaMesh:
 def triangulate(heights: FloatArray, x: FloatArray, y: FloatArray, wind_direction: float) -> SeaMesh:
     """Return the triangle mesh for heights on grid lines.
 
-    Cells are split along the diagonal from (i+1, j) to (i, j+1), as `realization.facet_slope_variance` assumes.
+    Cells are split along the diagonal from (i+1, j) to (i, j+1), as `wave_spectrum.facet_slope_variance` assumes.
 
     `heights`: elevation [m], shape (len(y), len(x)). `x`, `y`: grid line positions [m], increasing. `wind_direction`:
     direction of the first texture coordinate [rad], counter-clockwise from +x.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -33,6 +34,7 @@ from mitransient_lidar.physics.sea.shoaling import (
     band_wavenumbers,
     is_limited,
     limited_wake,
+    waves_of_time,
 )
 from mitransient_lidar.physics.sea.wave_spectrum import (
     CosineSpectrum,
@@ -51,6 +53,9 @@ from mitransient_lidar.physics.sea.wind_spectra import (
 )
 
 logger = logging.getLogger(__name__)
+
+#: Most heights of patches that are computed together: they share.
+_TOGETHER = 2**20
 
 #: Smallest slope variance of the ripples along one axis: a perfectly smooth facet has no connection to a point laser.
 _LEAST_VARIANCE = 1e-5
@@ -161,7 +166,7 @@ class SeaSurface:
                 if depths is not None and bands is not None:
                     bottom = DepthResponse.of_state(state, bands), depths
                     waves = ShoalingHeights(waves, *bottom)
-                waves_at = partial(_waves_at, given, motion, rest, bottom)
+                waves_at = partial(waves_of_time, given, motion, rest, bottom)
             elif wake is None and not any(slope):
                 cell = math.inf
         elif spectrum == "height_map":
@@ -283,18 +288,26 @@ class SeaSurface:
         """
         cell = self.line_distance
         half = max(1, math.ceil(0.5 * refined_size / cell))
-        lines = np.array([np.round(place / cell) for place in places])[..., None] + np.arange(-half, half + 1)
-        heights = [
-            sea.heights_about(place, *(numbers * cell))
-            if np.isfinite(self.cell_size)
-            else np.zeros((2 * half + 1,) * 2)
-            for place, sea, numbers in zip(places, seas, lines, strict=True)
-        ]
-        return np.array(heights), np.asarray(lines[..., 0] * cell, np.float64)
+        lines = (np.round(places / cell)[..., None] + np.arange(-half, half + 1)) * cell
+        each = list(seas)
+        heights = np.zeros((len(places), 2 * half + 1, 2 * half + 1))
+        together = max(_TOGETHER // heights[0].size, 1) if np.isfinite(self.cell_size) else 0
+        # Patches at one time of the sea together.
+        for _, of_sea in itertools.groupby(range(len(places) if together else 0), lambda row: id(each[row])):
+            rows = list(of_sea)
+            for first in range(0, len(rows), together):
+                some = slice(rows[first], rows[0] + min(first + together, len(rows)))
+                heights[some] = each[rows[0]].heights_about(places[some], lines[some, 0], lines[some, 1])
+        return heights, np.asarray(lines[..., 0], np.float64)
 
     def heights(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return elevations [m] on grid lines x and y [m], integer multiples of the cells, shape (len(y), len(x))."""
-        heights = np.zeros((len(y), len(x))) if self.waves is None else self.waves.sample(x, y)
+        """Return elevations [m] on grid lines x and y [m], integer multiples of the cells, shape (len(y), len(x)).
+
+        Lines of several patches, shapes (n, len(x)) and (n, len(y)), give theirs, shape (n, len(y), len(x)).
+        """
+        if x.ndim > 1 and (self.wake is not None or isinstance(self.waves, HeightMap)):
+            return np.array([self.heights(*lines) for lines in zip(x, y, strict=True)])
+        heights = np.zeros((*y.shape, x.shape[-1])) if self.waves is None else self.waves.sample(x, y)
         return heights if self.wake is None else heights + self.wake(x, y)
 
     @property
@@ -336,16 +349,16 @@ class SeaSurface:
         return replace(mesh, foam=share.ravel()[mesh.faces].mean(axis=1))
 
     def heights_about(self, place: Sequence[float] | FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return `heights` under a lidar that is aimed at a place (x, y) [m], inclined by the mean slope.
+        """Return `heights` under a lidar that is aimed at a place (x, y) [m], or each patch's place (n, 2), inclined.
 
         The plane of the mean slope turns about the place and is as wide as the patch; beyond it the sea is level.
         """
         heights = self.heights(x, y)
         if not any(self.slope):
             return heights
-        reach = 0.5 * self.refined_size
-        dx, dy = (np.clip(lines - middle, -reach, reach) for lines, middle in zip((x, y), place, strict=True))
-        return np.asarray(heights + self.slope[0] * dx + self.slope[1] * dy[:, None])
+        reach, middle = 0.5 * self.refined_size, np.asarray(place)
+        dx, dy = (np.clip(lines - middle[..., axis, None], -reach, reach) for axis, lines in enumerate((x, y)))
+        return np.asarray(heights + self.slope[0] * dx[..., None, :] + self.slope[1] * dy[..., :, None])
 
 
 def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: float) -> SeaState | None:
@@ -377,18 +390,6 @@ def _read_waves(read: Read, spectrum: str, wind_speed: float, wind_direction: fl
             raise UserError(f"swell_height = {swell_height:g} needs a spectrum of waves, not {spectrum!r}")
         components.append(SwellSpectrum(swell_height, swell_wavelength, swell_direction))
     return SeaState(tuple(components)) if components else None
-
-
-def _waves_at(
-    given: tuple[SeaState, float, float, int],
-    motion: Motion,
-    rest: tuple[float, FloatArray | None],
-    bottom: tuple[DepthResponse, BottomDepths] | None,
-    time: float,
-) -> PeriodicHeights | ShoalingHeights:
-    """Return the waves of `realise_heights`, whose parameters are given, at a time [s], maybe over a bottom."""
-    waves = realise_heights(*given, replace(motion, time=time), None, *rest)[0]
-    return waves if bottom is None else ShoalingHeights(waves, *bottom)
 
 
 def followed_depths(read: Read, depths: BottomDepths | None) -> BottomDepths | None:

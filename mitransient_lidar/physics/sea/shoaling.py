@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mitransient_lidar.core.validation import ArrayLike, FloatArray
-from mitransient_lidar.physics.sea.realization import Interpolation, PeriodicHeights
+from mitransient_lidar.physics.sea.realization import Interpolation, Motion, PeriodicHeights, realise_heights
 from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.wind_spectra import ShallowSpectrum, SwellSpectrum
 
@@ -25,6 +25,9 @@ _LEAST_DEPTH, _DEPTH_RATIO, _DEEPEST = 1e-4, 1.05, 10.0
 
 #: Sharpness of smooth minima: 1 % from the smaller of two values that differ by 1.35, 9 % from equal ones.
 _SHARPNESS = 8.0
+
+#: Distance of points between which the changes of long waves are interpolated [m].
+_LATTICE = 0.25
 
 #: Wavenumbers in the integral for the elevation variance, and the least of the largest one [rad/m].
 _NODES, _SHORTEST = 600, 100.0
@@ -155,8 +158,22 @@ class ShoalingHeights:
         """Return elevations [m] on grid lines x and y [m], shape (len(y), len(x)); see `HeightGrid.sample`.
 
         With band amplitudes a, this is a_top times all waves, plus (a - a_top) times each band. Bands over which the
-        depth has no effect cost no time, and leave the heights unchanged.
+        depth has no effect cost no time, and leave the heights unchanged. Where a_top does not change, the bands'
+        waves are long: close lines have them by interpolation between points `_LATTICE` apart.
         """
+        # Patches beside each other have the same points.
+        if (np.ptp(x) / _LATTICE + 4) * (np.ptp(y) / _LATTICE + 4) < y.size * x.shape[-1]:
+            lattice = Interpolation.of_lattice(_LATTICE, x, y)
+            columns, rows = (np.arange(each.min(), each.max() + 1) for each in (lattice.columns, lattice.rows))
+            change, more = self._changes(columns * _LATTICE, rows * _LATTICE)
+            if isinstance(change, float):
+                more = more[lattice.rows[..., None] - rows[0], lattice.columns[..., None, :] - columns[0]]
+                return np.asarray(self.waves.sample(x, y) * change + lattice.between(more))
+        change, more = self._changes(x, y)
+        return np.asarray(self.waves.sample(x, y) * change + more)
+
+    def _changes(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray | float, FloatArray]:
+        """Return the amplitude of the shortest waves, one number where it is constant, and what bands add [m]."""
         table, top = self.response.amplitude, self.response.top
         place = np.interp(self.depths.sample(x, y), self.response.depth, np.arange(table.shape[1]))
         index = np.minimum(place.astype(np.intp), table.shape[1] - 2)
@@ -167,7 +184,7 @@ class ShoalingHeights:
                 return float(row[used[0]])
             return np.asarray(row[index] + (row[index + 1] - row[index]) * (place - index))
 
-        heights = np.asarray(self.waves.sample(x, y) * at(table[top]))
+        heights = np.zeros(place.shape)
         bands = [(number, band) for number, band in self.waves.bands if np.any(table[number, used] != table[top, used])]
         for period in dict.fromkeys(band.period for _, band in bands):
             numbers, own = zip(*((number, band) for number, band in bands if band.period == period), strict=True)
@@ -181,7 +198,7 @@ class ShoalingHeights:
             else:
                 for row, one in zip(excess, waves, strict=True):
                     heights += at(row) * grid.between(one)
-        return heights
+        return at(table[top]), heights
 
 
 def limited_wake(
@@ -194,3 +211,15 @@ def limited_wake(
         return np.asarray(bound * np.tanh(wake(x, y) / bound))
 
     return limited
+
+
+def waves_of_time(
+    given: tuple[SeaState, float, float, int],
+    motion: Motion,
+    rest: tuple[float, FloatArray | None],
+    bottom: tuple[DepthResponse, BottomDepths] | None,
+    time: float,
+) -> PeriodicHeights | ShoalingHeights:
+    """Return the waves of `realise_heights`, whose parameters are given, at a time [s], maybe over a bottom."""
+    waves = realise_heights(*given, replace(motion, time=time), None, *rest)[0]
+    return waves if bottom is None else ShoalingHeights(waves, *bottom)

@@ -302,3 +302,26 @@ def _upwind_fraction(up: FloatArray, cross: FloatArray) -> FloatArray:
     total = up + cross
     fraction = np.divide(up, total, out=np.full_like(total, 0.5), where=total > 0)
     return np.clip(fraction, 1 - _LARGEST_FRACTION, _LARGEST_FRACTION)
+
+
+def facet_slope_variance(
+    variance: FloatArray, ix: IntArray, iy: IntArray, period: float, cells: float, axis: float
+) -> tuple[float, float]:
+    """Return the slope variances [1] along and across an axis for the facets that sample waves.
+
+    `variance`: elevation variances [m^2] of the waves, shape (len(iy), len(ix)); overwritten. `ix`, `iy`: their numbers
+    of wavelengths along x and y over the period, from `realization.wave_numbers`. `period`, `cells`: period [m], and
+    its length in cells, which may be broken. `axis`: direction [rad], counter-clockwise from +x.
+
+    Facet slopes are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d, d the cell side.
+    Their covariance is for cells split along the diagonal from (i+1, j) to (i, j+1), averaged over both triangles in a
+    cell. It is 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds oblique to the
+    mesh.
+    """
+    variance[:, 1:] *= 2  # for the half plane kx < 0
+    # sin(a) sin(b) cos(a - b) = sin(2a) sin(2b)/4 + sin(a)^2 sin(b)^2
+    a, b = ix * np.pi / cells, iy * np.pi / cells
+    square_a, square_b = np.sin(a) ** 2, np.sin(b) ** 2
+    x, y = variance.sum(axis=0) @ square_a, variance.sum(axis=1) @ square_b
+    xy = np.sin(2 * b) @ variance @ np.sin(2 * a) / 4 + square_b @ variance @ square_a
+    return variances_along(np.array([[x, xy], [xy, y]]) * (2 * cells / period) ** 2, axis)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,9 @@ from mitransient_lidar.transport.scene_parts import seas_of
 
 #: Reach of the mean over the beam's footprint, in its standard deviations, and smallest number of cells in one of them.
 _REACH, _FEWEST_CELLS = 4.5, 4
+
+#: Most cells whose means are computed together.
+_MOST_CELLS = 2**20
 
 #: Slopes along and across the lidar's azimuth for each kind of shot, in units of `slope_sigmas` standard deviations.
 SLOPE_KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sideways": (0.0, 1.0)}
@@ -158,9 +162,7 @@ def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPose
         # The rotation of the shot's frame also turns with the pixels.
         turns = shots.in_scene.azimuth - lidar.receiver.pose.azimuth
     seas = [sea] * len(places) if sea is None or shots.times_s is None else map(sea.at, shots.times_s.tolist())
-    rows = zip(seas, places, turns, strict=True)
-    means = [footprint_means(waves, lidar.transmitter, x, y, turn) for waves, (x, y), turn in rows]
-    along, across, height = np.array(means).T
+    along, across, height = footprint_means(list(seas), lidar.transmitter, places, turns).T
     own = lidar.receiver.pose
     origins, axes = own.origin + np.pad(places - own.in_scene(own.ground_point())[:2], ((0, 0), (0, 1))), own.axis
     if shots.in_scene is not None:
@@ -232,28 +234,30 @@ def sea_of(scene: mi.Scene) -> SeaSurface | None:
 
 
 def footprint_means(
-    sea: SeaSurface | None, transmitter: Transmitter, x: float, y: float, turn: float = 0.0
-) -> tuple[float, float, float]:
-    """Return the slopes along the lidar's azimuth and to its left [1] and the height [m] at a place [m] of a sea.
+    seas: Sequence[SeaSurface | None], transmitter: Transmitter, places: FloatArray, turns: FloatArray
+) -> FloatArray:
+    """Return the slopes along the lidar's azimuth and to its left [1] and the height [m] at places, shape (n, 3).
 
-    They are means over the beam's footprint on the mean sea level, an elliptic Gaussian, and 0 without waves. The lidar
-    may be turned about the vertical [rad].
+    They are means over the beam's footprint on the mean sea level, an elliptic Gaussian, and 0 without waves. Each of
+    the places (x, y) [m], shape (n, 2), has its sea, all of them one at several times, and a lidar turned about the
+    vertical [rad].
     """
+    sea, count = seas[0], len(places)
     if sea is None or not math.isfinite(sea.cell_size):
-        return 0.0, 0.0, 0.0
+        return np.zeros((count, 3))
     azimuth, along, across = footprint(transmitter)
-    azimuth += turn
     reach = max(math.ceil(_REACH * along / sea.cell_size), _FEWEST_CELLS)
-    steps = np.arange(-reach, reach + 1)
-    lines_x, lines_y = (
-        np.asarray((round(place / sea.cell_size) + steps) * sea.cell_size, dtype=np.float64) for place in (x, y)
-    )
-    heights = sea.heights_about((x, y), lines_x, lines_y)
-    up, right = np.gradient(heights, sea.cell_size)
-    cos, sin = math.cos(azimuth), math.sin(azimuth)
-    dx, dy = np.meshgrid(lines_x - x, lines_y - y)
+    together = max(_MOST_CELLS // (2 * reach + 1) ** 2, 1)
+    if count > together:
+        starts = range(0, count, together)
+        some = [slice(first, first + together) for first in starts]
+        return np.concatenate([footprint_means(seas[one], transmitter, places[one], turns[one]) for one in some])
+    heights, corners = sea.height_patches(places, (2 * reach - 1) * sea.cell_size, [one for one in seas if one])
+    up, right = np.gradient(heights, sea.cell_size, axis=(1, 2))
+    cos, sin = (turned[:, None, None] for turned in (np.cos(azimuth + turns), np.sin(azimuth + turns)))
+    away = (corners - places)[..., None] + sea.cell_size * np.arange(2 * reach + 1)
+    dx, dy = away[:, 0, None, :], away[:, 1, :, None]
     weight = np.exp(-0.5 * (((cos * dx + sin * dy) / along) ** 2 + ((cos * dy - sin * dx) / across) ** 2))
-    weight /= weight.sum()
+    weight /= weight.sum(axis=(1, 2), keepdims=True)
     values = (cos * right + sin * up, cos * up - sin * right, heights)
-    slope_along, slope_across, height = (float(np.sum(weight * value)) for value in values)
-    return slope_along, slope_across, height
+    return np.stack([np.sum(weight * value, axis=(1, 2)) for value in values], axis=1)

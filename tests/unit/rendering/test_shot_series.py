@@ -11,6 +11,7 @@ from rows import each_case, each_row, must_refuse
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.rendering import render as single
 from mitransient_lidar.rendering.shots import batches as shot_batches
 from mitransient_lidar.rendering.shots import series as shot_series
@@ -36,17 +37,19 @@ MEAN_SLOPE = 0.02, -0.03
 class Wave:
     """A plane wave, with the interface of a sea."""
 
-    cell_size = 0.25
+    cell_size = line_distance = 0.25
+    height_patches = SeaSurface.height_patches
 
     def __init__(self, k_x, k_y):
         self.k = k_x, k_y
 
     def heights(self, x, y):
-        return 0.3 * np.cos(self.k[0] * x + self.k[1] * y[:, np.newaxis] + 0.4)
+        return 0.3 * np.cos(self.k[0] * x[..., np.newaxis, :] + self.k[1] * y[..., np.newaxis] + 0.4)
 
     def heights_about(self, place, x, y):
         """The mean slope, about the place, adds to the wave's."""
-        return self.heights(x, y) + MEAN_SLOPE[0] * (x - place[0]) + MEAN_SLOPE[1] * (y[:, np.newaxis] - place[1])
+        dx, dy = x - place[..., :1], y - place[..., 1:]
+        return self.heights(x, y) + MEAN_SLOPE[0] * dx[..., np.newaxis, :] + MEAN_SLOPE[1] * dy[..., np.newaxis]
 
 
 class Beam:
@@ -76,8 +79,10 @@ def test_truth_is_the_mean_of_a_wave_over_an_elliptic_gaussian(azimuth, k_x, k_y
     slopes = (part - k * damped * math.sin(phase) for part, k in zip(mean, (k_along, k_across), strict=True))
     expected = [*slopes, damped * math.cos(phase)]
     # Central differences of the wave's heights are flatter by up to (k h)^2/6 = 0.8 %.
-    found = shot_truth.footprint_means(Wave(k_x, k_y), Beam(azimuth), x, y)
-    np.testing.assert_allclose(found, expected, rtol=0.01, atol=1e-4)
+    # One lidar has the azimuth, the other one is turned by it.
+    for beam, turn in ((azimuth, 0.0), (0.0, azimuth)):
+        found = shot_truth.footprint_means([Wave(k_x, k_y)], Beam(beam), np.array([[x, y]]), np.array([turn]))
+        np.testing.assert_allclose(found[0], expected, rtol=0.01, atol=1e-4)
 
 
 def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):

@@ -1,5 +1,7 @@
 """Depths of bottoms below places, and objects within plugins."""
 
+import math
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -106,3 +108,12 @@ def test_all_loading_is_serial(monkeypatch):
     )
     open_scene("table1", {"spectrum": "flat"})
     assert asked == [False]
+
+
+def test_no_ray_passes_between_the_faces_of_a_bottom():
+    """Of these places 55 lie on edges that single rays miss."""
+    slope = math.radians(5.0)
+    scene, _ = sea_over({"bottom": {"type": "seabed", "depth": 5.0, "slope_x_deg": 5.0, "size": 80.0}})
+    lines = 0.02 * np.arange(-700, 700)
+    expected = np.broadcast_to(5.0 - math.tan(slope) * lines, (lines.size,) * 2)
+    np.testing.assert_allclose(bottom_depths(scene).sample(lines, lines), expected, atol=1e-3)

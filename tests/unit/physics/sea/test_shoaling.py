@@ -168,3 +168,17 @@ def test_bands_together_are_those_one_by_one(slope):
     for number, band in sea.waves.waves.bands:
         expected += (amplitude[number] - amplitude[response.top]) * band.sample(x, x)
     np.testing.assert_allclose(sea.heights(x, x), expected, atol=1e-6)
+
+
+def test_long_waves_of_close_lines_are_those_of_coarse_ones():
+    """Patches of close lines, which interpolate what depth changes, against lines too far apart for it."""
+    slope = BottomDepths(-10.0, lambda x, y: -0.05 * x[..., None, :] + 0 * y[..., None])
+    sea = over(slope, wind_speed=6.0, **{**SPECTRUM, "cell_size": 0.05})
+    first = np.array([[-120.0, 3.0], [-118.0, 4.0], [-60.0, -10.0]])
+    lines = first[..., None] + sea.cell_size * np.arange(80)
+    found = sea.heights(lines[:, 0], lines[:, 1])
+    for heights, (x, y) in zip(found, lines, strict=True):
+        # The ends and the middle, between which the points of an interpolation would be more than the lines.
+        far = [0, 39, 79]
+        np.testing.assert_allclose(heights[np.ix_(far, far)], sea.heights(x[far], y[far]), atol=1e-5)
+    assert np.std(found) > 0.05
