@@ -14,6 +14,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths, corrections_for
 from mitransient_lidar.analysis.waveforms.depth_errors import mean_slope
+from mitransient_lidar.analysis.waveforms.echo_classes import FEW_EVENTS_CHANCE
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoClass, EchoFlag
 from mitransient_lidar.campaigns.store import PLANNED, Store
 from mitransient_lidar.core.constants import C0
@@ -241,7 +242,7 @@ def _quality(points: xr.Dataset, echoes: xr.Dataset, infrared: npt.NDArray[np.bo
     quality |= np.where(kind == PointClass.UNCLASSIFIED, int(Quality.ABOVE_WATER), 0)
     if "class" in echoes:
         quality |= np.where(of_echo("class") == EchoClass.MERGED, int(Quality.MERGED), 0)
-        chance = echoes["class_probability"].transpose("shot", "pixel").values[place]
+        chance = _with_few_events(echoes["class_probability"].transpose("shot", "pixel").values[place], flags)
         quality |= np.where(~silent & (chance < _CERTAIN), int(Quality.UNCERTAIN), 0)
     if "beyond_table" in echoes:
         behind = (kind == PointClass.BOTTOM) | (kind == PointClass.OBJECT)
@@ -281,8 +282,14 @@ def _of_light(flown: Flown, points: xr.Dataset, echoes: xr.Dataset) -> dict[str,
     return {
         "pseudo_reflectance": ("point", np.where(silent, np.nan, reflectance)),
         "optical_depth": ("point", np.where(wet, attenuation * path, np.nan)),
-        "class_probability": ("point", np.where(silent, np.nan, chance)),
+        "class_probability": ("point", np.where(silent, np.nan, _with_few_events(chance, points["flags"].values))),
     }
+
+
+def _with_few_events(chance: npt.NDArray[Any], flags: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return probabilities of points, at most one half where they may be single events of the detector."""
+    few = (flags & int(EchoFlag.FEW_EVENTS)) > 0
+    return np.where(few, np.minimum(chance, FEW_EVENTS_CHANCE), chance)
 
 
 def describe_points(points: xr.Dataset) -> list[str]:

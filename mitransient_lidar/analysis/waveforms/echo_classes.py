@@ -31,6 +31,9 @@ from mitransient_lidar.core.validation import FloatArray
 #: Distance in air per two-way time [m/ns].
 IN_AIR = 0.5e-9 * C0
 
+#: Largest probability of an echo that may be a single event of the detector.
+FEW_EVENTS_CHANCE = 0.5
+
 _FAR = 4.0  # standard deviations of the surface's time beyond which an echo before others stands above the water
 _APART = 1.2  # least separation of two echoes of which the first one stands above the water, in echo widths
 _WEAK, _FAR_APART = 15.0, 8.0  # height of a weak first echo over the noise, and farthest others behind it, in widths
@@ -42,6 +45,7 @@ _COLUMN, _COLUMN_NS = 5.0, 20.0
 _OVER_BOTTOM = 0.9  # least probability of a clear surface without a column that may rather be a bottom than land
 _CLEAR = 8.0  # least height over the noise of clear echoes
 _SHALLOW = 2.0  # largest depth of bottoms that are told from first echoes [m]
+_OF_EVENTS = 0.5  # variance over mean signal of samples with single events, relative to the height that these reach
 _OPEN = 2.0  # least length of a column between two echoes that tells a weak surface, in echo widths
 
 
@@ -129,6 +133,8 @@ def decide(
     land, surface and bottom counts, however faint the echo is. Above 8 standard errors, a bottom that is likelier than
     land is preferred to a surface without a column whose probability is below 90 %. In the near infrared, where column
     and bottom are part of the surface's echo, a first echo is land or the surface, and nothing follows the surface.
+    Samples have at least the noise of the detector's single events in them. A bottom that is no higher than these, and
+    has no surface, has a probability of one half.
 
     150 records of each kind were drawn: VQ-880-G II at nadir and 600 m, a level known to 0.15 m, glints from none to
     five times the bottom's echo, reflectances 0.05 to 0.4. All land from 0.2 to 4 m is land, and 99 % of the bottoms
@@ -223,6 +229,8 @@ def decide(
         has_column &= at_level & ~near[tested]
         tested = tested[~has_column]
     probability = np.where((found.bins >= 0).any(axis=0), 1.0, 0.0)
+    few = (found.flags[-1] & int(EchoFlag.FEW_EVENTS)) > 0
+    probability[few & (found.surface < 0) & (found.bins[-1] >= 0)] = FEW_EVENTS_CHANCE
     if not tested.size:
         return Decision(found, above, probability, tested)
     lines = lines.at(tested)
@@ -242,7 +250,8 @@ def decide(
     heights = records.power[tested, pair]
     peak = pair[np.argmax(heights, axis=0), np.arange(len(tested))]
     extent = np.where(near[tested], (following[tested] - peak) * records.bin_ns + width, 0.0)
-    first = first_echoes(records.part(tested), peak, pulse, shape, width, priors, extent)
+    own = _with_events(records.part(tested), waveforms.events(part)[tested])
+    first = first_echoes(own, peak, pulse, shape, width, priors, extent)
     land, sea, bottom = first.chance
     decided = sea < np.where(is_clear[tested] & (bottom > land), _OVER_BOTTOM, np.maximum(land, bottom))
     probability[tested] = np.where(decided, np.maximum(land, bottom), sea)
@@ -265,6 +274,17 @@ def _decided(one: Decision, records: Records, shape: EchoShape, width: float) ->
         bins[place, rows] = np.where(exists, np.clip(at, 0, records.time_ns.size - 1), -1)
         flags[place, rows] = np.where(exists, of_merged * merged, none)
     return replace(one, found=DetectedEchoes(bins, flags))
+
+
+def _with_events(records: Records, events: FloatArray) -> Records:
+    """Return records whose noise is at least that of the events, of heights of shape (n,), that samples consist of.
+
+    The stated noise is that of the mean light: where less than one event is expected, one would be certain light.
+    """
+    if not (events > 0).any():
+        return records
+    counted = np.sqrt(_OF_EVENTS * events[:, np.newaxis] * np.maximum(records.power, 0))
+    return replace(records, noise=np.maximum(records.noise, counted))
 
 
 def _surface_alone(found: DetectedEchoes, above: BoolArray) -> DetectedEchoes:

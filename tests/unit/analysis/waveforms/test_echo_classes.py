@@ -161,6 +161,14 @@ def test_faint_first_echoes_at_the_surface_level_are_the_likeliest_class():
     assert (np.abs(depth - [*-heights, *depths]) < 3 * error).all()
 
 
+def test_a_first_echo_no_higher_than_a_single_event_is_no_certain_bottom():
+    """The stated noise is that of the mean light: an event where none is expected was a bottom with p = 0.999."""
+    record = recorded([pulse(SURFACE + 2 * N * 0.4 / C, 0.2 * UNIT)] * 3 + [water(0.5)], 6)
+    mean = record["signal_mean"].values
+    record["event_height"] = record["event_height"].copy(data=[mean.max() - np.median(mean)])
+    assert (echo_table.extract(record)["class_probability"].values[:3] < 0.6).all()
+
+
 def test_turbid_water_seen_by_long_pulses_has_no_bottom():
     """A blurred bottom below a column of a free decay fits such columns as well, with more parameters."""
     kinds = [(k, b, glint) for k, b in ((0.5, 0.03), (0.75, 0.1)) for glint in (0.0, 0.02)]
