@@ -54,9 +54,12 @@ KINDS = {
 PLACES, ERROR, DEPTH_PER_NS = 60, 0.02, 0.5 * 0.299792458 / 1.34
 
 
-def measured(series: xr.Dataset) -> xr.Dataset:
-    """Return echoes with the render errors of flights."""
-    return mt.echoes(series.assign(waveform_stderr=pooled_errors(series, few=False)), targets=1)
+def measured(both: list[xr.Dataset]) -> list[xr.Dataset]:
+    """Return the echoes of two series, each with the errors of both as flights have them: other weights are a bias."""
+    few = [one.assign(waveform_stderr=pooled_errors(one, few=True)) for one in both]
+    pooled = [pooled_errors(one, few=False) for one in few]
+    error = np.hypot(*(one.values for one in pooled))
+    return [mt.echoes(one.assign(waveform_stderr=(pooled[0].dims, error)), targets=1) for one in both]
 
 
 def slabs(series: xr.Dataset) -> np.ndarray:
@@ -79,7 +82,7 @@ def compared(name: str) -> str:
     maps = mt.render_shots(scene, params, light="maps", **options)
     by_maps = time.process_time() - began
     merged = mt.render_shots(scene, params, target_error=ERROR, first_seed=1000, axis=None, **options)
-    both = [measured(one) for one in (maps, merged)]
+    both = measured([maps, merged])
     depth, error, energy, kind = (
         [one[variable].sel(echo="bottom").values for one in both]
         for variable in ("depth_m", "depth_m_stderr", "energy", "class")
@@ -87,7 +90,7 @@ def compared(name: str) -> str:
     found = [np.isfinite(each) & (number > 0) for each, number in zip(depth, kind, strict=True)]
     used = found[0] & found[1]
     apart = 100 * (depth[0] - depth[1])[used]
-    z = apart / 100 / np.hypot(*error)[used]
+    z = apart / 100 / error[0][used]
     bottom, water = 100 * (energy[0] / energy[1] - 1)[used], [slabs(one) for one in (maps, merged)]
     lit = water[1] > 0.05 * water[1].max(axis=(1, 2), keepdims=True)
     slab = 100 * (water[0][lit] / water[1][lit] - 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import logging
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -64,6 +65,8 @@ _RIGHT, _NONE, _ALL = 1.0, 0.05, 0.98
 _FARTHEST, _ESTIMATOR = 200.0, "gaussian"
 
 _WAVELENGTH = 532.0  #: Wavelength of waters by name, which is that of the table of any green instrument [nm].
+
+_LOG = logging.getLogger(__name__)
 
 #: Passes of light maps, as in flights, relative standard error of renders below their reach, and depths of a range.
 _PASSES, _ERROR, _IN_RANGE = 2, 0.05, 200
@@ -327,6 +330,9 @@ class _Bottoms:
         cells: dict[float, dict[str, Any]] = {}
         low, high = float(site.min()), further * float(site.max())
         top, deepest = low, min(high, _FIRST, max(self._reach, low))
+        if high > self._reach:
+            text = "light maps reach %.3g m in this water: each deeper bottom is merged, in about half a minute"
+            _LOG.info(text, self._reach)
         self._choose_settings(site, deepest)
         while True:
             nodes = [one for one in _nodes(top, deepest, _COARSE).tolist() if one not in cells]
@@ -399,16 +405,9 @@ class _Bottoms:
 
     def _merged(self, depth: float) -> xr.Dataset:
         """Return the light of a bottom at a depth [m], merged; raise KeyboardInterrupt if it was interrupted."""
-        series: xr.Dataset = render_shots(
-            self.scene,
-            {**self.params, "bottom_depth": depth},
-            positions=self._places,
-            instrument=self.instrument,
-            target_error=_ERROR,
-            first_seed=self.seed * 2**20,
-            describe_sea=False,
-        )
-        return uninterrupted(series)
+        params, seed = {**self.params, "bottom_depth": depth}, self.seed * 2**20
+        options: dict[str, Any] = {"instrument": self.instrument, "target_error": _ERROR, "first_seed": seed}
+        return uninterrupted(render_shots(self.scene, params, positions=self._places, describe_sea=False, **options))
 
     def _labelled(self, cells: Mapping[float, Mapping[str, Any]]) -> xr.Dataset:
         """Return a table as of `depth_bias.depth_bias`."""
