@@ -39,7 +39,7 @@ MaxTime = Annotated[
 Passes = Annotated[
     int | None, Option("Stop after this many independent passes, by default at the target error", 2, MOST_PASSES)
 ]
-SignedSeed = Annotated[int | None, Option("Random seed, by default 0", 0, 2**53)]
+RenderSeed = Annotated[int | None, Option("Random seed, by default 0", 0, 2**53)]
 PassShare = Annotated[float | None, Option("Share of a full pass's paths in each pass", SMALLEST_SHARE, 1)]
 MaxMemory = Annotated[
     float | None, positive_option("Memory for histograms [GB], by default 2; with less, only gates are kept")
@@ -98,7 +98,7 @@ class RenderOptions:
     target_quantile: TargetQuantile = None
     max_time: MaxTime = None
     passes: Passes = None
-    seed: SignedSeed = None
+    seed: RenderSeed = None
     pass_share: PassShare = None
     max_memory: MaxMemory = None
     components: Components = None
@@ -407,6 +407,11 @@ def pass_seed(seed: int, number: int) -> int:
     """Return a pass seed, different from any other pass seed with any other seed."""
     sequence = np.random.SeedSequence([int(seed) & 0xFFFFFFFFFFFFFFFF, number])
     return int(sequence.generate_state(1, np.uint64)[0])
+
+
+def render_seed(seed: int, number: int) -> int:
+    """Return the seed of one of a study's renders, within the range of seeds."""
+    return pass_seed(seed, number) >> 11
 
 
 def _quantiles(errors: FloatArray, quantile: float) -> tuple[float | None, float | None, float | None]:

@@ -54,7 +54,7 @@ def render_passive(
         int | Sequence[int] | None,
         Option("Stop after this many passes, by default at the target error", 2, engine.MOST_PASSES),
     ] = None,
-    seed: engine.SignedSeed = None,
+    seed: engine.RenderSeed = None,
     frames: Annotated[int, Option("Number of animation frames, by default 1", 1, MOST_FRAMES)] = 1,
     frame_step_s: Annotated[
         float, Option("Time between frames, by default 0.1", 0, unit="s", above=True, flag="--frame-step")

@@ -56,7 +56,7 @@ def render(
     target_quantile: engine.TargetQuantile = None,
     max_time: engine.MaxTime = None,
     passes: engine.Passes = None,
-    seed: engine.SignedSeed = None,
+    seed: engine.RenderSeed = None,
     max_memory: engine.MaxMemory = None,
     pass_share: float | None = None,
     components: engine.Components = None,

@@ -30,7 +30,7 @@ from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.scenes import open_scene
 from mitransient_lidar.loading.variants import alone
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
-from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
+from mitransient_lidar.rendering.passes import ProgressCallback, render_seed
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.studies.cases import Cases
@@ -135,8 +135,7 @@ def bounds(
     for design in cases:
         results = []
         for i in range(renders):
-            # Render seeds are signed.
-            options: dict[str, Any] = {"derivatives": list(free), "passes": passes, "seed": pass_seed(seed, i) >> 1}
+            options: dict[str, Any] = {"derivatives": list(free), "passes": passes, "seed": render_seed(seed, i)}
             options["instrument"] = instrument
             results.append(cases.keep(render(scene, params={**(params or {}), **design}, **options)))
             cases.step()

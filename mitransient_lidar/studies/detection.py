@@ -39,7 +39,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.camera import Camera
 from mitransient_lidar.physics.receiver.chain import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import CAMERAS
-from mitransient_lidar.rendering.passes import ProgressCallback, pass_seed
+from mitransient_lidar.rendering.passes import ProgressCallback, render_seed
 from mitransient_lidar.results.attributes import label
 from mitransient_lidar.studies.cases import Cases
 from mitransient_lidar.studies.target_signal import (
@@ -224,8 +224,8 @@ def detect(
                 sea = open_scene(scene, {**moved, "surface_seed": number}, instrument)
                 # The records of all seas have the first one's bins.
                 axis = axis or find_lidar_scene(sea.scene, sea.sensor).axis
-            own = pass_seed(seed, i) >> 1  # render seeds are signed
-            options: dict[str, Any] = {"target_id": target_id, "passes": passes, "integrator": integrator, "seed": own}
+            options: dict[str, Any] = {"target_id": target_id, "passes": passes, "integrator": integrator}
+            options["seed"] = render_seed(seed, i)
             if camera is not None:
                 one = target_gates(sea, **options)
             else:

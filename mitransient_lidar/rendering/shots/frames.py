@@ -29,7 +29,7 @@ from mitransient_lidar.rendering.passes import (
     PassShare,
     Progress,
     ProgressCallback,
-    SignedSeed,
+    RenderSeed,
     pass_seed,
     warn_of_edge_loss,
 )
@@ -77,7 +77,7 @@ def render_frames(
     passes: Annotated[int, Option("Passes of each image, by default 4", 2, 10_000)] = 4,
     pass_share: PassShare = None,
     max_memory: Annotated[float | None, positive_option("Memory for all frames [GB], by default 2")] = None,
-    seed: SignedSeed = None,
+    seed: RenderSeed = None,
     light: Light = None,
     integrator: Any = None,
     instrument: Instrument = None,
