@@ -140,3 +140,20 @@ def test_ripples_of_a_series_are_refused():
         surface(**STEEP, bsdf={"type": "dielectric"})
     with pytest.raises(Exception, match=r"2[01] and 41 % of the slope variances .* longer shortest_wave than 0.25 m"):
         surface(slope_distribution="gram_charlier", wind_speed=3.0, shortest_wave=0.25, refined_size=4.0)
+
+
+@each_row((0.0, True), (90.0, False), (180.0, True))
+def test_ripples_are_rougher_along_the_wind(direction, along_x):
+    """Wind 10 m/s: slope variance 0.0316 up- and 0.0222 crosswind, on the axes that the wind direction says."""
+    scene, shape = surface(spectrum="flat", wind_speed=10.0, wind_direction_deg=direction)
+    assert shape.sea.ripple_variance == pytest.approx((0.0316, 0.0222))
+    si = interaction(scene, [0, 0, 1])
+    tilt = 0.3
+    values = []
+    for slope in ([tilt, 0.0], [0.0, tilt]):
+        normal = np.array([-slope[0], -slope[1], 1.0]) / np.hypot(1, tilt)
+        mirror = 2 * normal[2] * normal - np.array([0, 0, 1.0])
+        bsdf = shape.bsdf().eval(mi.BSDFContext(), si, si.to_local(mi.Vector3f(mirror.tolist())))
+        values.append(np.array(bsdf).ravel()[0])
+    ratio = values[0] / values[1] if along_x else values[1] / values[0]
+    assert ratio == pytest.approx(np.exp(-0.5 * tilt**2 * (1 / 0.0316 - 1 / 0.0222)), rel=2e-3)

@@ -4,10 +4,12 @@ The lidar looks towards +x, so that a target at +y is left of its line of sight.
 """
 
 import numpy as np
+import OpenImageIO
 import pytest
 from matplotlib.image import imread
 
 import mitransient_lidar
+from mitransient_lidar import results
 from mitransient_lidar.analysis.gates.cut import cut_gates
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.plots.gates.images import plot_gates
@@ -29,6 +31,7 @@ def echo_ns(dataset):
 
 
 def near_echo(dataset):
+    """Return whether bins may hold the target's echo."""
     return np.abs(dataset["time"] - echo_ns(dataset)) < 8
 
 
@@ -65,6 +68,34 @@ def test_arrays(stack):
     assert float((bright * stack["angle_y"]).sum() / bright.sum()) == pytest.approx(1e3 * 1.5 / 215.5, abs=1.5)
     assert np.all(np.diff(stack["angle_y"]) < 0)
     assert np.all(np.diff(stack["angle_x"], axis=0) < 0)
+
+
+@pytest.mark.slow
+def test_published_pixels():
+    """Red is far and left, green far and right, blue and black are near."""
+    shot = rendered("2x2")
+    late = near_echo(shot)
+    energy, error = (shot[name].where(late, 0).sum("time") for name in ("impulse_response", "impulse_response_stderr"))
+    assert shot["pixel"].values.tolist() == ["red", "green", "blue", "black"]
+    for other in ("green", "blue", "black"):
+        difference = float(energy.sel(pixel="red") - energy.sel(pixel=other))
+        assert difference > 5 * float(error.sel(pixel=["red", other]).sum())
+
+
+@pytest.mark.slow
+def test_exr_files_in_another_reader(imager, stack, tmp_path):
+    results.save(imager, tmp_path / "a.exr")
+    image = OpenImageIO.ImageInput.open(str(tmp_path / "a.exr"))
+    names, values = image.spec().channelnames, np.asarray(image.read_image("float"))
+    image.close()
+    at = [names.index(f"bin{index:04d}.Y") for index in np.flatnonzero(near_echo(imager))]
+    assert far_left_exceeds(values[..., at].sum(axis=-1))
+    results.save(stack, tmp_path / "b.exr")
+    image = OpenImageIO.ImageInput.open(str(tmp_path / "b.exr"))
+    assert image.seek_subimage(1, 0)
+    names, values = image.spec().channelnames, np.asarray(image.read_image("float"))
+    image.close()
+    assert far_left_exceeds(values[..., names.index("Y")])
 
 
 @pytest.mark.slow

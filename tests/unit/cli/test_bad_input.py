@@ -1,6 +1,9 @@
 """Invalid input: one sentence on stderr with parameter and value, exit code 2, no output and no file."""
 
+import os
 import re
+import subprocess
+import sys
 
 import mitsuba as mi
 import numpy as np
@@ -255,3 +258,16 @@ def test_exhausted_memory_is_one_sentence_and_other_runtime_errors_stay_bugs():
 
         with pytest.raises(kind, match=sentence):
             run_passes(render_pass, Goal(passes=2), seed=0)
+
+
+@pytest.mark.slow
+@each_row(("/etc/passwd", "'/etc/passwd'"), ("/nowhere.so", "is not a file"))
+def test_another_library_than_llvm(library, part, tmp_path):
+    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": library}
+    command = [sys.executable, "-m", "mitransient_lidar", "render", "table1", "-o", str(tmp_path / "out")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.splitlines()[-1].startswith("Dr") or "DRJIT_LIBLLVM_PATH" in done.stderr
+    assert part in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
