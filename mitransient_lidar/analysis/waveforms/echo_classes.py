@@ -42,7 +42,7 @@ _TWICE, _SECOND = 0.1, 5.0  # of a peak, light that meets the bottom twice, and 
 _RETURNS, _BRIGHTEST = (2.2, 3.2), 0.5
 # Standard errors of a column's energy that make the echo before it the surface's, and its length [ns].
 _COLUMN, _COLUMN_NS = 5.0, 20.0
-_OVER_BOTTOM = 0.9  # least probability of a clear surface without a column that may rather be a bottom than land
+_LEAST_BOTTOM = 0.25  # probability of a clear bottom over the surface's from which it counts instead
 _CLEAR = 8.0  # least height over the noise of clear echoes
 _SHALLOW = 2.0  # largest depth of bottoms that are told from first echoes [m]
 _OF_EVENTS = 0.5  # variance over mean signal of samples with single events, relative to the height that these reach
@@ -131,8 +131,9 @@ def decide(
     object above the water. First echoes without others, or with others nearer than 1.8 echo widths, are those of
     `first_echoes.first_echoes`, unless they are at the surface's level and a column follows them. The likeliest of
     land, surface and bottom counts, however faint the echo is. Above 8 standard errors, a bottom that is likelier than
-    land is preferred to a surface without a column whose probability is below 90 %. In the near infrared, where column
-    and bottom are part of the surface's echo, a first echo is land or the surface, and nothing follows the surface.
+    land is preferred to a surface without a column that is at most four times as likely. In the near infrared, where
+    column and bottom are part of the surface's echo, a first echo is land or the surface, and nothing follows the
+    surface.
     Samples have at least the noise of the detector's single events in them. A bottom that is no higher than these, and
     has no surface, has a probability of one half.
 
@@ -213,7 +214,8 @@ def decide(
     # An echo at the record's end may have a column behind it.
     left = records.time_ns[-1] - records.time_of(found.surface)
     behind = np.minimum(following, last - 1)
-    is_clear = ~_is_weak(records, found.surface, _CLEAR) | (near & ~_is_weak(records, behind, _CLEAR))
+    counted = _with_events(records, waveforms.events(part))
+    is_clear = ~_is_weak(counted, found.surface, _CLEAR) | (near & ~_is_weak(counted, behind, _CLEAR))
     is_whole = left > waveforms.tail_ns + _COLUMN_NS
     opaque = waveforms.fading.opaque
     if opaque:
@@ -250,10 +252,10 @@ def decide(
     heights = records.power[tested, pair]
     peak = pair[np.argmax(heights, axis=0), np.arange(len(tested))]
     extent = np.where(near[tested], (following[tested] - peak) * records.bin_ns + width, 0.0)
-    own = _with_events(records.part(tested), waveforms.events(part)[tested])
-    first = first_echoes(own, peak, pulse, shape, width, priors, extent)
+    first = first_echoes(counted.part(tested), peak, pulse, shape, width, priors, extent)
     land, sea, bottom = first.chance
-    decided = sea < np.where(is_clear[tested] & (bottom > land), _OVER_BOTTOM, np.maximum(land, bottom))
+    as_bottom = is_clear[tested] & (bottom > land) & (bottom > _LEAST_BOTTOM * sea)
+    decided = as_bottom | (sea < np.maximum(land, bottom))
     probability[tested] = np.where(decided, np.maximum(land, bottom), sea)
     return _decided(Decision(found, above, probability, tested[decided], first.part(decided)), records, shape, width)
 
