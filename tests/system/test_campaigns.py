@@ -172,7 +172,7 @@ def shard_code(monkeypatch, arrays, start="pass"):
     code = (
         f"import os, signal; from mitransient_lidar.campaigns import runs, shard\n{start}\n"
         f"arrays = runs.RunRenderer.arrays\nrender = lambda self, number, values: {arrays}\n"
-        "runs.RunRenderer.arrays = render; shard._main()"
+        "runs.RunRenderer.arrays = render; shard.main()"
     )
     original = subprocess.Popen
     monkeypatch.setattr(
