@@ -92,7 +92,7 @@ def shard_processes(mark):
             state = (entry / "stat").read_text().rsplit(")", 1)[1].split()[0]
         except OSError:
             continue
-        if b"mitransient_lidar.campaigns.shard" in command and variable in environment and state != "Z":
+        if shards._PROGRAM.encode() in command and variable in environment and state != "Z":
             found.append(int(entry.name))
     return found
 
