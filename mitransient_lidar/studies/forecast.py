@@ -331,7 +331,7 @@ class _Bottoms:
         low, high = float(site.min()), further * float(site.max())
         top, deepest = low, min(high, _FIRST, max(self._reach, low))
         if high > self._reach:
-            text = "light maps reach %.3g m in this water: each deeper bottom is merged, in about half a minute"
+            text = "light maps reach %.3g m in this water: deeper bottoms are merged, one by one"
             _LOG.info(text, self._reach)
         self._choose_settings(site, deepest)
         while True:
